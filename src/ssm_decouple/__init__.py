@@ -1,0 +1,87 @@
+"""Selective decoupling for free-floating space manipulators, on Pinocchio.
+
+Protect the directions of the base that matter, leave the rest of the arm's freedom to the task:
+
+    import numpy as np
+    import ssm_decouple as ssm
+
+    robot = ssm.load_robot("ets_vii")
+    q = robot.configuration(np.deg2rad([150, -20, -10, 0, 0, 0]))
+    law = ssm.SelectiveLaw(robot, ssm.Protection("yaw"), gain=0.05)
+    motion = ssm.simulate(law, q, target=[-1.8, -0.3, 1.2], duration=150.0, dt=0.1)
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from ssm_decouple.control.law import Command as Command
+    from ssm_decouple.control.law import SelectiveLaw as SelectiveLaw
+    from ssm_decouple.errors import DecoupleError as DecoupleError
+    from ssm_decouple.errors import DecoupleWarning as DecoupleWarning
+    from ssm_decouple.errors import FileError as FileError
+    from ssm_decouple.errors import InputError as InputError
+    from ssm_decouple.errors import ModelError as ModelError
+    from ssm_decouple.model.catalogue import example_robot as example_robot
+    from ssm_decouple.model.catalogue import load_robot as load_robot
+    from ssm_decouple.model.catalogue import models as models
+    from ssm_decouple.model.compose import compose as compose
+    from ssm_decouple.model.report import Report as Report
+    from ssm_decouple.model.robot import Robot as Robot
+    from ssm_decouple.momentum.coupling import Coupling as Coupling
+    from ssm_decouple.momentum.protection import Protection as Protection
+    from ssm_decouple.simulation.motion import load_motion as load_motion
+    from ssm_decouple.simulation.motion import save_motion as save_motion
+    from ssm_decouple.simulation.simulate import SimulationInterrupted as SimulationInterrupted
+    from ssm_decouple.simulation.simulate import simulate as simulate
+    from ssm_decouple.studies.case import Case as Case
+    from ssm_decouple.studies.case import cases as cases
+    from ssm_decouple.studies.case import load_case as load_case
+    from ssm_decouple.studies.comparison import Comparison as Comparison
+    from ssm_decouple.studies.comparison import compare as compare
+
+__version__ = "0.1.0"
+
+# Each public name and the module that it comes from: imported when first used, so that `import ssm_decouple` is quick.
+_HOME = {
+    "Case": "studies.case",
+    "Command": "control.law",
+    "Comparison": "studies.comparison",
+    "Coupling": "momentum.coupling",
+    "DecoupleError": "errors",
+    "DecoupleWarning": "errors",
+    "FileError": "errors",
+    "InputError": "errors",
+    "ModelError": "errors",
+    "Protection": "momentum.protection",
+    "Report": "model.report",
+    "Robot": "model.robot",
+    "SelectiveLaw": "control.law",
+    "SimulationInterrupted": "simulation.simulate",
+    "cases": "studies.case",
+    "compare": "studies.comparison",
+    "compose": "model.compose",
+    "example_robot": "model.catalogue",
+    "load_case": "studies.case",
+    "load_motion": "simulation.motion",
+    "load_robot": "model.catalogue",
+    "models": "model.catalogue",
+    "save_motion": "simulation.motion",
+    "simulate": "simulation.simulate",
+}
+
+__all__ = ["__version__", *_HOME]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME:
+        raise AttributeError(f"module 'ssm_decouple' has no attribute '{name}'")
+    value = getattr(import_module(f"ssm_decouple.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

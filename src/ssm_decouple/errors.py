@@ -1,0 +1,23 @@
+"""What can go wrong, in one small family: catch `DecoupleError` for all of it."""
+
+from __future__ import annotations
+
+
+class DecoupleError(Exception):
+    """Base of every error that this package raises on purpose."""
+
+
+class ModelError(DecoupleError, ValueError):
+    """A robot description that cannot be read or cannot be simulated."""
+
+
+class InputError(DecoupleError, ValueError):
+    """An argument, a protection or a case that makes no sense; the message names the value and the mend."""
+
+
+class FileError(DecoupleError, OSError):
+    """A file that cannot be read as what it should be, or a place that cannot be written."""
+
+
+class DecoupleWarning(UserWarning):
+    """Something that runs, but probably not as meant."""

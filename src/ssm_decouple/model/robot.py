@@ -1,0 +1,278 @@
+"""The robot: a URDF on a free-flyer root, with names."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import ArrayLike, NDArray
+
+from ssm_decouple.errors import DecoupleWarning, InputError, ModelError
+from ssm_decouple.model.urdf import inspect_urdf, parse_urdf, root_link, tip_links
+
+if TYPE_CHECKING:
+    from ssm_decouple.model.report import Report
+    from ssm_decouple.momentum.coupling import Coupling
+
+Floats = NDArray[np.float64]
+UNLIMITED = 1e300  # Pinocchio writes the largest double where a URDF gives no limit
+
+
+class Robot:
+    """A spacecraft with arms, free to float: URDF text read by Pinocchio with a free-flyer root.
+
+    `model` is the Pinocchio model and every configuration q is an ordinary Pinocchio configuration, so that any
+    Pinocchio function works on them. Velocities are v = [base linear; base angular; joint rates], the base twist in
+    base axes.
+
+    Args:
+        urdf: URDF text.
+        name: What the robot is called in messages and results.
+        end_effector: The link or frame that the tasks move. None takes the link called "end_effector", else the only
+            tip of the arm.
+
+    Attributes:
+        urdf: The URDF text.
+        name: As given.
+        model: The `pinocchio.Model`.
+        n_joints: Number n of joints after the root.
+        joint_names: Names of those joints, in the order of the joint rates.
+        end_effector: Name of the end-effector's frame; the root link where there is no joint.
+        end_effector_id: Its Pinocchio frame index.
+        rate_limits: Joint rate limits (n,) from the URDF, rad/s or m/s; inf where it gives none.
+        position_limits: Lower and upper joint limits (n, 2), rad or m; infinite for continuous joints.
+        mass: Total mass, kg.
+
+    Raises:
+        ModelError: the text is no URDF, cannot be simulated, or the end-effector does not exist or is ambiguous.
+    """
+
+    def __init__(self, urdf: str, *, name: str, end_effector: str | None = None) -> None:
+        root = parse_urdf(urdf, name)
+        findings = inspect_urdf(root)
+        impossible = [finding for finding in findings if finding.level == "impossible"]
+        if impossible:
+            more = f" (and {len(impossible) - 1} more: `ssm-decouple check` lists them)" if impossible[1:] else ""
+            raise ModelError(f"robot '{name}': {impossible[0]}{more}")
+        inertias = [finding for finding in findings if "principal moment" in finding.message]
+        if inertias:
+            listed = "; ".join(str(finding) for finding in inertias)
+            warnings.warn(f"robot '{name}': no solid body has such an inertia: {listed}", DecoupleWarning, stacklevel=3)
+
+        self.urdf = urdf
+        self.name = name
+        try:
+            self.model: pin.Model = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
+        except (ValueError, RuntimeError) as error:
+            raise ModelError(f"robot '{name}': Pinocchio cannot read it: {error}") from error
+        self._data: pin.Data = self.model.createData()
+        self._neutral: Floats = pin.neutral(self.model)
+        self.n_joints: int = self.model.nv - 6
+        self.joint_names: tuple[str, ...] = tuple(self.model.names[2:])
+        self.mass: float = pin.computeTotalMass(self.model)
+        self.end_effector = self._choose_end_effector(end_effector, tip_links(root), root_link(root))
+        self.end_effector_id: int = self.model.getFrameId(self.end_effector)
+        rates = np.array(self.model.velocityLimit[6:])
+        self.rate_limits: Floats = np.where((rates > 0) & (rates < UNLIMITED), rates, np.inf)
+        self.position_limits: Floats = self._read_position_limits()
+        self._refuse_singular_inertia()
+
+    def _choose_end_effector(self, wanted: str | None, tips: list[str], root: str) -> str:
+        frames = [frame.name for frame in self.model.frames if frame.type == pin.FrameType.BODY]
+        if wanted is None:
+            if "end_effector" in frames:
+                return "end_effector"
+            if len(tips) > 1:
+                raise ModelError(
+                    f"robot '{self.name}' has {len(tips)} tips: name one as end_effector: {', '.join(tips)}"
+                )
+            return tips[0] if tips else root
+        if not self.model.existFrame(wanted):
+            raise ModelError(
+                f"robot '{self.name}' has no frame '{wanted}' for its end-effector; it has {', '.join(frames)}"
+            )
+        return wanted
+
+    def _read_position_limits(self) -> Floats:
+        limits = np.full((self.n_joints, 2), [-np.inf, np.inf])
+        for i, joint in enumerate(self.model.joints[2:]):
+            if joint.nq == 1:
+                limits[i] = self.model.lowerPositionLimit[joint.idx_q], self.model.upperPositionLimit[joint.idx_q]
+        return limits
+
+    def _refuse_singular_inertia(self) -> None:
+        pin.computeCentroidalMap(self.model, self._data, self._neutral)
+        smallest, *_, largest = np.linalg.eigvalsh(np.array(self._data.Ag[3:, 3:6]))
+        if not smallest > 1e-12 * largest:
+            raise ModelError(
+                f"robot '{self.name}': the whole has no rotational inertia about some axis (principal moments "
+                f"{smallest:.3g} to {largest:.3g} kg m2), so H_ww is singular; give its links inertias"
+            )
+
+    def __repr__(self) -> str:
+        return f"Robot({self.name!r}, {self.n_joints} joints, {self.mass:g} kg, end_effector={self.end_effector!r})"
+
+    def configuration(
+        self, joints: ArrayLike | Mapping[str, float] | None = None, base_pose: pin.SE3 | ArrayLike | None = None
+    ) -> Floats:
+        """Build a Pinocchio configuration.
+
+        Args:
+            joints: Joint positions, rad or m: an array (n,) in the order of `joint_names`, or a mapping by joint name
+                in which missing joints are zero. None is all zero.
+            base_pose: Pose of the base frame in the inertial frame, a `pin.SE3` or a homogeneous matrix (4, 4).
+                None is the identity.
+
+        Returns:
+            The configuration q (nq,). A continuous joint takes two entries of it, cosine and sine.
+
+        Raises:
+            InputError: wrong length, an unknown joint name, a value that is not finite, or no rigid pose.
+        """
+        displacement = np.zeros(self.model.nv)
+        if isinstance(joints, Mapping):
+            for name, value in joints.items():
+                displacement[6 + self.joint_index(name)] = value
+        elif joints is not None:
+            values = np.asarray(joints, dtype=float)
+            if values.shape != (self.n_joints,):
+                raise InputError(
+                    f"joint positions have shape {values.shape}, '{self.name}' needs ({self.n_joints},): "
+                    f"{', '.join(self.joint_names)}"
+                )
+            displacement[6:] = values
+        if not np.all(np.isfinite(displacement)):
+            bad = [self.joint_names[i] for i in np.flatnonzero(~np.isfinite(displacement[6:]))]
+            raise InputError(f"joint positions are not finite at {', '.join(bad)}")
+        q: Floats = pin.integrate(self.model, self._neutral, displacement)
+        if base_pose is not None:
+            q[:7] = pin.SE3ToXYZQUAT(_rigid_pose(base_pose))
+        return q
+
+    def joint_index(self, name: str) -> int:
+        """Return the place of a joint among the joint rates.
+
+        Raises:
+            InputError: no such joint.
+        """
+        try:
+            return self.joint_names.index(name)
+        except ValueError:
+            raise InputError(f"'{self.name}' has no joint '{name}'; it has {', '.join(self.joint_names)}") from None
+
+    def joint_positions(self, q: ArrayLike) -> Floats:
+        """Return the joint positions (n,), rad or m, of a configuration; continuous joints within (-pi, pi]."""
+        return pin.difference(self.model, self._neutral, self.checked(q))[6:]
+
+    def checked(self, q: ArrayLike) -> Floats:
+        """Return q as an array that Pinocchio takes.
+
+        Raises:
+            InputError: wrong length, not finite, or its quaternion q[3:7] is not of unit length.
+        """
+        values = np.asarray(q, dtype=float)
+        if values.shape != (self.model.nq,):
+            raise InputError(
+                f"configuration has shape {values.shape}, '{self.name}' needs ({self.model.nq},); "
+                "build it with robot.configuration(..)"
+            )
+        if not np.all(np.isfinite(values)):
+            raise InputError(
+                f"configuration is not finite at q[{', '.join(map(str, np.flatnonzero(~np.isfinite(values))))}]"
+            )
+        length = float(np.linalg.norm(values[3:7]))
+        if abs(length - 1.0) > 1e-6:
+            raise InputError(f"quaternion q[3:7] has length {length:.7g}, not 1; use pinocchio.normalize(model, q)")
+        return values
+
+    def base_pose(self, q: ArrayLike) -> pin.SE3:
+        """Return the pose of the base frame in the inertial frame."""
+        return pin.XYZQUATToSE3(self.checked(q)[:7])
+
+    def frame_pose(self, q: ArrayLike, frame: str | None = None) -> pin.SE3:
+        """Return the pose of a frame, by default the end-effector's, in the inertial frame."""
+        index = self.end_effector_id if frame is None else self.model.getFrameId(frame)
+        if index >= self.model.nframes:
+            raise InputError(f"'{self.name}' has no frame '{frame}'")
+        pin.framesForwardKinematics(self.model, self._data, self.checked(q))
+        return self._data.oMf[index].copy()
+
+    @property
+    def reach(self) -> float:
+        """Distance, m, from the arm's first joint to the end-effector if the arm could be pulled straight."""
+        frame = self.model.frames[self.end_effector_id]
+        length = float(np.linalg.norm(frame.placement.translation))
+        chain = [joint for joint in self.model.supports[frame.parentJoint] if joint > 1]
+        for joint in chain[1:]:
+            length += float(np.linalg.norm(self.model.jointPlacements[joint].translation))
+        for joint in chain:
+            if self.model.joints[joint].shortname().startswith("JointModelP"):
+                length += float(np.abs(self.position_limits[joint - 2]).max())
+        return length
+
+    def shoulder_position(self, q: ArrayLike) -> Floats:
+        """Return where the arm's first joint stands (3,), m, inertial axes."""
+        chain = [
+            joint for joint in self.model.supports[self.model.frames[self.end_effector_id].parentJoint] if joint > 1
+        ]
+        pin.forwardKinematics(self.model, self._data, self.checked(q))
+        return self._data.oMi[chain[0] if chain else 1].translation.copy()
+
+    def coupling(self, q: ArrayLike) -> Coupling:
+        """Return the momentum matrices at q: H_ww, H_wq, J_rc, J_base, J_g and more.
+
+        Raises:
+            InputError: q has the wrong length or is not finite.
+        """
+        from ssm_decouple.momentum.coupling import Coupling  # the next room: this method only opens its door
+
+        return Coupling.at(self, q)
+
+    def momentum(self, q: ArrayLike, v: ArrayLike) -> Floats:
+        """Return the momentum of a motion: [linear; angular about the system centre of mass], inertial axes.
+
+        Args:
+            q: Configuration (nq,).
+            v: Velocity (6 + n,): base twist in base axes, then joint rates.
+
+        Returns:
+            Momentum (6,), kg m/s and kg m2/s.
+
+        Raises:
+            InputError: q or v has the wrong length or is not finite.
+        """
+        velocity = np.asarray(v, dtype=float)
+        if velocity.shape != (self.model.nv,) or not np.all(np.isfinite(velocity)):
+            raise InputError(
+                f"velocity needs {self.model.nv} finite numbers: base twist (6), joint rates ({self.n_joints})"
+            )
+        pin.computeCentroidalMomentum(self.model, self._data, self.checked(q), velocity)
+        return np.array(self._data.hg.vector)
+
+    def report(self) -> Report:
+        """Return what the robot is made of and what is suspicious in it; print it to read it."""
+        from ssm_decouple.model.report import Report
+
+        return Report.of_robot(self)
+
+
+def _rigid_pose(pose: pin.SE3 | ArrayLike) -> pin.SE3:
+    if isinstance(pose, pin.SE3):
+        matrix = pose.homogeneous
+    else:
+        matrix = np.asarray(pose, dtype=float)
+        if matrix.shape != (4, 4):
+            raise InputError(f"a pose is a pinocchio.SE3 or a homogeneous matrix (4, 4), not shape {matrix.shape}")
+    rotation = matrix[:3, :3]
+    if (
+        not np.all(np.isfinite(matrix))
+        or np.linalg.norm(rotation.T @ rotation - np.eye(3)) > 1e-6
+        or np.linalg.det(rotation) < 0
+    ):
+        raise InputError(
+            "the pose's rotation block is not a rotation: its columns must be right-handed and orthonormal"
+        )
+    return pin.SE3(rotation, matrix[:3, 3])

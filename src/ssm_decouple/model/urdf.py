@@ -1,0 +1,270 @@
+"""URDF text: read, inspected before anything is built on it, and its shapes."""
+
+from __future__ import annotations
+
+import xml.etree.ElementTree as ET
+from collections import Counter
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ssm_decouple.errors import ModelError
+
+ONE_DOF_JOINTS = ("revolute", "continuous", "prismatic")
+Level = Literal["note", "suspicious", "impossible"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Something worth knowing about a robot description.
+
+    Attributes:
+        level: "impossible" refuses the robot, "suspicious" probably is a mistake in the file, "note" is harmless.
+        where: The link or joint meant, for example "link forearm".
+        message: What is the matter, with the value, and what to do.
+    """
+
+    level: Level
+    where: str
+    message: str
+
+    def __str__(self) -> str:
+        return f"{self.where}: {self.message}"
+
+
+def read_urdf(path: str | Path) -> str:
+    """Return the text of a URDF file.
+
+    Raises:
+        ModelError: no such file, or not text.
+    """
+    try:
+        return Path(path).read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ModelError(f"'{path}' is not a URDF: it is not text") from error
+    except OSError as error:
+        raise ModelError(f"cannot read '{path}': {error.strerror or error}") from error
+
+
+def parse_urdf(text: str, source: str) -> ET.Element:
+    """Return the <robot> element of URDF text.
+
+    Raises:
+        ModelError: not XML, not a URDF, or still a xacro.
+    """
+    try:
+        root = ET.fromstring(text)
+    except ET.ParseError as error:
+        raise ModelError(f"'{source}' is not XML: {error}") from error
+    if root.tag != "robot":
+        raise ModelError(f"'{source}' is XML but not a URDF: its root is <{root.tag}>, expected <robot>")
+    if any("xacro" in str(element.tag) for element in root.iter()):
+        raise ModelError(f"'{source}' still has xacro macros: expand it first with `xacro FILE > robot.urdf`")
+    return root
+
+
+def floats(text: str | None, default: tuple[float, ...]) -> NDArray[np.float64]:
+    """Parse a URDF attribute such as xyz="0 0 1"."""
+    return np.array(default if text is None else [float(word) for word in text.split()])
+
+
+def inspect_urdf(root: ET.Element) -> list[Finding]:
+    """Say everything that is impossible, suspicious or worth a note in a parsed URDF."""
+    try:
+        return [*_inspect_tree(root), *_inspect_joints(root), *_inspect_inertias(root)]
+    except (ValueError, TypeError) as error:
+        return [Finding("impossible", "file", f"a number or a name is missing or malformed ({error})")]
+
+
+def _inspect_tree(root: ET.Element) -> list[Finding]:
+    found: list[Finding] = []
+    links = [link.get("name", "") for link in root.findall("link")]
+    if not links:
+        return [Finding("impossible", "robot", "has no <link>")]
+    for kind in ("link", "joint"):
+        names = Counter(element.get("name", "") for element in root.findall(kind))
+        found += [
+            Finding("impossible", f"{kind} {name}", f"this name stands {count} times; rename all but one")
+            for name, count in names.items()
+            if count > 1
+        ]
+    parents: dict[str, str] = {}
+    for joint in root.findall("joint"):
+        where = f"joint {joint.get('name')}"
+        for role in ("parent", "child"):
+            end = joint.find(role)
+            link = None if end is None else end.get("link")
+            if link not in links:
+                found.append(Finding("impossible", where, f"its {role} link '{link}' does not exist"))
+        if found:
+            continue
+        parent, child = (joint.find(role).get("link", "") for role in ("parent", "child"))  # type: ignore[union-attr]
+        if child in parents:
+            found.append(Finding("impossible", where, f"link '{child}' already has a parent; URDF is a tree"))
+        parents[child] = parent
+    if not found:
+        roots = [link for link in links if link not in parents]
+        if len(roots) != 1:
+            found.append(Finding("impossible", "robot", f"needs exactly one root link, has {roots or 'a loop'}"))
+    return found
+
+
+def _inspect_joints(root: ET.Element) -> list[Finding]:
+    found = []
+    for joint in root.findall("joint"):
+        where, kind = f"joint {joint.get('name')}", joint.get("type")
+        if kind == "fixed":
+            continue
+        if kind not in ONE_DOF_JOINTS:
+            known = ", ".join(ONE_DOF_JOINTS)
+            found.append(Finding("impossible", where, f"type '{kind}' is not supported; use fixed or one of {known}"))
+            continue
+        if joint.find("mimic") is not None:
+            found.append(Finding("suspicious", where, "<mimic> is not followed: the joint moves on its own"))
+        limit = joint.find("limit")
+        if limit is None:
+            if kind == "continuous":
+                found.append(Finding("note", where, "no <limit>: its rate is unlimited unless the law is given one"))
+            else:
+                advice = 'add <limit lower=".." upper=".." effort=".." velocity=".."/> or make it continuous'
+                found.append(Finding("impossible", where, f"a {kind} joint without <limit>; {advice}"))
+            continue
+        if not float(limit.get("velocity", "0")) > 0:
+            found.append(Finding("suspicious", where, "no velocity limit above zero: give the law a rate_limit"))
+        lower, upper = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
+        if kind != "continuous" and not upper > lower:
+            found.append(Finding("suspicious", where, f"position limits [{lower:g}, {upper:g}] leave it no room"))
+    return found
+
+
+def _inspect_inertias(root: ET.Element) -> list[Finding]:
+    found, total = [], 0.0
+    moved = {
+        joint.find("child").get("link")  # type: ignore[union-attr]
+        for joint in root.findall("joint")
+        if joint.get("type") != "fixed" and joint.find("child") is not None
+    }
+    for link in root.findall("link"):
+        where, inertial = f"link {link.get('name')}", link.find("inertial")
+        if inertial is None:
+            if link.get("name") in moved:
+                found.append(Finding("note", where, "moved by a joint but has no <inertial>"))
+            continue
+        mass = _attribute(inertial, "mass", "value")
+        total += mass
+        if not (np.isfinite(mass) and mass >= 0):
+            found.append(Finding("impossible", where, f"mass {mass:g} kg; it must be zero or more"))
+            continue
+        inertia = _inertia_matrix(inertial)
+        if not np.all(np.isfinite(inertia)):
+            found.append(Finding("impossible", where, "inertia is not finite"))
+            continue
+        small, middle, large = np.linalg.eigvalsh(inertia)
+        if mass == 0:
+            level: Level = "suspicious" if link.get("name") in moved else "note"
+            found.append(Finding(level, where, "zero mass"))
+        if small < -1e-9 * max(large, 1e-300):
+            found.append(Finding("suspicious", where, f"inertia has the negative principal moment {small:.4g} kg m2"))
+        elif small + middle < large * (1 - 1e-6):
+            moments = f"{small:.4g}, {middle:.4g}, {large:.4g}"
+            found.append(
+                Finding("suspicious", where, f"principal moments {moments} kg m2 break the triangle inequality")
+            )
+    if not total > 0:
+        found.append(Finding("impossible", "robot", "no link has mass, so there is no momentum to conserve"))
+    return found
+
+
+def _attribute(element: ET.Element, child: str, name: str) -> float:
+    found = element.find(child)
+    if found is None or found.get(name) is None:
+        raise ValueError(f"<{element.tag}> lacks <{child} {name}=..>")
+    return float(found.get(name, ""))
+
+
+def _inertia_matrix(inertial: ET.Element) -> NDArray[np.float64]:
+    xx, xy, xz, yy, yz, zz = (_attribute(inertial, "inertia", f"i{ij}") for ij in ("xx", "xy", "xz", "yy", "yz", "zz"))
+    return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+def root_link(root: ET.Element) -> str:
+    """Return the name of the link that has no parent."""
+    children = {child.get("link") for child in root.findall("joint/child")}
+    return next(link.get("name", "") for link in root.findall("link") if link.get("name") not in children)
+
+
+def tip_links(root: ET.Element) -> list[str]:
+    """Return the links at the ends of the branches that at least one joint moves, in file order."""
+    joints = {joint.find("child").get("link"): joint for joint in root.findall("joint")}  # type: ignore[union-attr]
+    parents = {joint.find("parent").get("link") for joint in joints.values()}  # type: ignore[union-attr]
+
+    def moves(link: str | None) -> bool:
+        while link in joints:
+            if joints[link].get("type") != "fixed":
+                return True
+            link = joints[link].find("parent").get("link")  # type: ignore[union-attr]
+        return False
+
+    names = [link.get("name", "") for link in root.findall("link")]
+    return [name for name in names if name not in parents and moves(name)]
+
+
+@dataclass(frozen=True)
+class Shape:
+    """A box, cylinder or sphere that stands for a piece of a link.
+
+    Attributes:
+        name: The name of the visual, or "" where the file gives none.
+        link: The link that it is fixed to.
+        kind: "box", "cylinder" (about its z axis) or "sphere".
+        size: Box edges (3,), cylinder (radius, length) or sphere (radius,), m.
+        xyz: Position in the link frame (3,), m.
+        rpy: Roll, pitch, yaw in the link frame (3,), rad.
+        color: Red, green, blue from 0 to 1.
+    """
+
+    name: str
+    link: str
+    kind: Literal["box", "cylinder", "sphere"]
+    size: tuple[float, ...]
+    xyz: NDArray[np.float64]
+    rpy: NDArray[np.float64]
+    color: tuple[float, float, float]
+
+
+def visual_shapes(text: str) -> list[Shape]:
+    """Return the boxes, cylinders and spheres among the visuals of URDF text; meshes are left out."""
+    root = ET.fromstring(text)
+    palette = {m.get("name"): m.find("color") for m in root.iter("material") if m.find("color") is not None}
+    shapes = []
+    for link in root.findall("link"):
+        for visual in link.findall("visual"):
+            shape = _shape(visual, link.get("name", ""), palette)
+            if shape is not None:
+                shapes.append(shape)
+    return shapes
+
+
+def _shape(visual: ET.Element, link: str, palette: dict[str | None, ET.Element | None]) -> Shape | None:
+    sizes: dict[Literal["box", "cylinder", "sphere"], tuple[str, ...]] = {
+        "box": ("size",),
+        "cylinder": ("radius", "length"),
+        "sphere": ("radius",),
+    }
+    material = visual.find("material")
+    color = (
+        None if material is None else (material.find("color") if len(material) else palette.get(material.get("name")))
+    )
+    red, green, blue = floats(None if color is None else color.get("rgba"), (0.7, 0.7, 0.7, 1.0))[:3]
+    origin = visual.find("origin")
+    place = {} if origin is None else origin.attrib
+    for kind, attributes in sizes.items():
+        element = visual.find(f"geometry/{kind}")
+        if element is not None:
+            size = tuple(float(x) for name in attributes for x in floats(element.get(name), ()))
+            xyz, rpy = (floats(place.get(key), (0.0, 0.0, 0.0)) for key in ("xyz", "rpy"))
+            return Shape(visual.get("name", ""), link, kind, size, xyz, rpy, (red, green, blue))
+    return None

@@ -1,0 +1,52 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from random_robots import random_robot
+
+import ssm_decouple as ssm
+
+UR5 = "ur_description/urdf/ur5_robot.urdf"
+
+
+@pytest.fixture(scope="session")
+def ets_vii() -> ssm.Robot:
+    return ssm.load_robot("ets_vii")
+
+
+@pytest.fixture(scope="session")
+def robots(ets_vii: ssm.Robot) -> dict[str, ssm.Robot]:
+    """The shipped arms, a composed one, and random trees."""
+    # MuJoCo, one of the oracles, cannot have a link called "world": hence the prefix.
+    composed = ssm.compose(
+        "ets_vii_bus", ssm.example_robot(UR5), [-0.79, -0.29, 1.0], prefix="arm_", end_effector="tool0"
+    )
+    known = {"ets_vii": ets_vii, "ets_vii_flight": ssm.load_robot("ets_vii_flight"), "composed": composed}
+    return known | {f"random_{seed}": random_robot(seed, joints=3 + seed % 6) for seed in range(8)}
+
+
+ROBOT_NAMES = ["ets_vii", "ets_vii_flight", "composed", *(f"random_{seed}" for seed in range(8))]
+
+
+@pytest.fixture(params=ROBOT_NAMES)
+def robot(request: pytest.FixtureRequest, robots: dict[str, ssm.Robot]) -> ssm.Robot:
+    return robots[request.param]
+
+
+@pytest.fixture
+def rng() -> np.random.Generator:
+    return np.random.default_rng(20260723)
+
+
+@pytest.fixture
+def write(tmp_path: Path):
+    """Write text to a file in a fresh folder and return its path."""
+
+    def writer(text: str, name: str = "robot.urdf") -> Path:
+        path = tmp_path / name
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    return writer
