@@ -1,0 +1,1 @@
+"""Momentum matrices of a configuration, and the protected subspace."""

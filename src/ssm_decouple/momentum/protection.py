@@ -1,0 +1,194 @@
+"""The protected subspace U_c: the directions about which the base must not turn."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ssm_decouple.errors import InputError
+
+if TYPE_CHECKING:
+    from ssm_decouple.momentum.coupling import Coupling
+
+Floats = NDArray[np.float64]
+Frame = Literal["base", "inertial"]
+
+AXES = {"roll": (1.0, 0.0, 0.0), "pitch": (0.0, 1.0, 0.0), "yaw": (0.0, 0.0, 1.0)}
+NAMES = ("none", *AXES, "all")
+TOLERANCE = 1e-3  # how far from orthonormal the given axes may be
+
+
+class Protection:
+    """The protected subspace: no base rotation about the columns of U_c (paper, eq. 5).
+
+    Args:
+        axes: A direction (3,), columns (3, k) with k up to 3, or a name: "none" (k = 0), "roll", "pitch", "yaw",
+            several joined by "+", or "all" (k = 3, reactionless). Directions must be orthonormal within 1e-3; they are
+            made orthonormal to machine precision by the smallest possible change.
+        frame: The axes in which the directions stay fixed: "base" (the paper's) or "inertial".
+
+    Attributes:
+        U_c: Orthonormal columns (3, k), read-only.
+        k: Number of protected directions.
+        frame: As given.
+        correction: Largest angle, rad, between a given direction and the one used. Scaling to unit length turns
+            nothing, so a single direction has 0.
+
+    Raises:
+        InputError: a zero, non-unit, non-finite or dependent direction, more than three, or an unknown name.
+
+    Example:
+        >>> Protection([0.5, 0, 0.866]).describe()
+        'k = 1, base axes: (0.500011, 0, 0.866019), 30.0007 deg from yaw'
+    """
+
+    def __init__(self, axes: ArrayLike | str, frame: Frame = "base") -> None:
+        if frame not in ("base", "inertial"):
+            raise InputError(f"frame is 'base' or 'inertial', not '{frame}'")
+        given = _named(axes) if isinstance(axes, str) else _columns(axes)
+        _refuse_far_from_orthonormal(given)
+        self.frame: Frame = frame
+        self.U_c: Floats = _nearest_orthonormal(given)
+        self.U_c.flags.writeable = False
+        self.k: int = self.U_c.shape[1]
+        cross = np.linalg.norm(np.cross(given, self.U_c, axis=0), axis=0)
+        self.correction: float = float(np.max(np.arctan2(cross, np.sum(given * self.U_c, axis=0)), initial=0.0))
+
+    @classmethod
+    def parse(cls, text: str) -> Protection:
+        """Read a protection from one word: a name, or numbers such as "0.5,0,0.866" or "1,0,0;0,0,1".
+
+        Put ";" between directions and "@inertial" behind them where they are fixed in inertial axes.
+
+        Raises:
+            InputError: as for the class, or the text cannot be read.
+        """
+        body, _, frame = text.partition("@")
+        if any(letter.isalpha() for letter in body.replace("e", "").replace("nan", "").replace("inf", "")):
+            return cls(body, frame or "base")  # type: ignore[arg-type]
+        try:
+            rows = [[float(word) for word in row.split(",")] for row in body.split(";")]
+            columns = np.array(rows).T
+        except ValueError:
+            raise InputError(f"cannot read the protection '{text}': {_HELP}") from None
+        return cls(columns, frame or "base")  # type: ignore[arg-type]
+
+    def __repr__(self) -> str:
+        return f"Protection({self.U_c.T.tolist()}, frame={self.frame!r})"
+
+    def describe(self) -> str:
+        """Say k, the frame and each direction with its angle from the nearest base axis."""
+        if self.k == 0:
+            return "k = 0: nothing is protected"
+        words = []
+        for column in self.U_c.T:
+            listed = ", ".join(f"{0.0 if abs(x) < 1e-15 else x:.6g}" for x in column)
+            name, angle = _nearest_axis(column)
+            words.append(
+                f"({listed}), {name}" if angle < 1e-12 else f"({listed}), {np.rad2deg(angle):.4f} deg from {name}"
+            )
+        turned = f"; turned by up to {np.rad2deg(self.correction):.2g} deg" if self.correction > 1e-12 else ""
+        return f"k = {self.k}, {self.frame} axes: {'; '.join(words)}{turned}"
+
+    def U_c_in(self, coupling: Coupling) -> Floats:
+        """Return U_c (3, k) in the axes of the coupling's matrices."""
+        if self.frame == coupling.frame:
+            return self.U_c
+        R = coupling.base_rotation
+        return R @ self.U_c if self.frame == "base" else R.T @ self.U_c
+
+    def J_sub(self, coupling: Coupling) -> Floats:
+        """Return the sub-coupling matrix J_sub = U_c^T J_rc (k, n), rad/s per joint rate (paper, eq. 7)."""
+        return self.U_c_in(coupling).T @ coupling.J_rc
+
+    def null_space_basis(self, coupling: Coupling) -> Floats:
+        """Return orthonormal columns Z (n, n - rank J_sub) that span null(J_sub)."""
+        J_sub = self.J_sub(coupling)
+        n = J_sub.shape[1]
+        if self.k == 0:
+            return np.eye(n)
+        _, singular, rows = np.linalg.svd(J_sub)
+        # Below the rounding of J_rc a row is no constraint.
+        rank = int(np.sum(singular > 16 * np.finfo(float).eps * np.linalg.norm(coupling.J_rc)))
+        return rows[rank:].T
+
+    def N_sub(self, coupling: Coupling) -> Floats:
+        """Return the projector N_sub = I - J_sub^+ J_sub on null(J_sub) (n, n)."""
+        Z = self.null_space_basis(coupling)
+        return Z @ Z.T
+
+
+_HELP = f"a name ({', '.join(NAMES)}, or several joined by '+') or numbers, '0.5,0,0.866' or '1,0,0;0,0,1'"
+
+
+def _named(name: str) -> Floats:
+    if name == "none":
+        return np.zeros((3, 0))
+    if name == "all":
+        return np.eye(3)
+    words = name.split("+")
+    unknown = [word for word in words if word not in AXES]
+    if unknown:
+        raise InputError(f"unknown protection '{name}': give {_HELP}")
+    return np.array([AXES[word] for word in words]).T
+
+
+def _columns(axes: ArrayLike) -> Floats:
+    try:
+        given = np.array(axes, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(f"U_c cannot be read as numbers: {axes!r}; give {_HELP}") from None
+    columns = given[:, None] if given.ndim == 1 else given
+    if columns.ndim != 2 or columns.shape[0] != 3:
+        hint = "; its transpose would do: directions are columns" if columns.ndim == 2 and columns.shape[1] == 3 else ""
+        raise InputError(f"U_c has shape {given.shape}, it needs (3,) or (3, k) with k up to 3{hint}")
+    if columns.shape[1] > 3:
+        raise InputError(
+            f"U_c has k = {columns.shape[1]} directions; space has 3: keep an orthonormal basis of their span"
+        )
+    return columns
+
+
+def _refuse_far_from_orthonormal(columns: Floats) -> None:
+    for i, column in enumerate(columns.T, 1):
+        if not np.all(np.isfinite(column)):
+            raise InputError(f"direction {i} of U_c, {column.tolist()}, is not finite")
+        length = float(np.linalg.norm(column))
+        if length == 0:
+            raise InputError(f"direction {i} of U_c is zero; drop it, or use 'none' to protect nothing")
+        if abs(length - 1) > TOLERANCE:
+            unit = ", ".join(f"{x:.6g}" for x in column / length)
+            raise InputError(
+                f"direction {i} of U_c, {column.tolist()}, has length {length:.6g}; did you mean ({unit})?"
+            )
+    for i in range(columns.shape[1]):
+        for j in range(i + 1, columns.shape[1]):
+            dot = float(columns[:, i] @ columns[:, j])
+            if abs(dot) > 1 - TOLERANCE:
+                raise InputError(f"directions {i + 1} and {j + 1} of U_c are the same; drop one")
+            if abs(dot) > TOLERANCE:
+                angle = np.rad2deg(np.arccos(np.clip(dot, -1, 1)))
+                raise InputError(
+                    f"directions {i + 1} and {j + 1} of U_c stand at {angle:.4g} deg; make them orthogonal, for "
+                    "example with numpy.linalg.qr: the protected subspace stays the same"
+                )
+
+
+def _nearest_orthonormal(columns: Floats) -> Floats:
+    if columns.shape[1] == 1:
+        return columns / np.linalg.norm(columns)
+    if np.array_equal(columns.T @ columns, np.eye(columns.shape[1])):
+        return columns.copy()
+    left, _, right = np.linalg.svd(columns, full_matrices=False)
+    nearest: Floats = left @ right
+    # One Newton step of the polar decomposition takes out what the rounding of the SVD left.
+    return 0.5 * nearest @ (3.0 * np.eye(nearest.shape[1]) - nearest.T @ nearest)
+
+
+def _nearest_axis(direction: Floats) -> tuple[str, float]:
+    names = list(AXES)
+    best = int(np.argmax(np.abs(direction)))
+    across = np.linalg.norm(np.delete(direction, best))
+    return names[best], float(np.arctan2(across, abs(direction[best])))

@@ -1,0 +1,130 @@
+from __future__ import annotations
+
+import numpy as np
+import pinocchio as pin
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from random_robots import random_state
+
+import ssm_decouple as ssm
+from ssm_decouple import Protection
+
+EPS = np.finfo(float).eps
+
+
+def test_names_and_directions_mean_the_same():
+    np.testing.assert_array_equal(Protection("yaw").U_c, Protection([0, 0, 1]).U_c)
+    np.testing.assert_array_equal(Protection("roll+yaw").U_c, Protection([[1, 0], [0, 0], [0, 1]]).U_c)
+    np.testing.assert_array_equal(Protection("all").U_c, np.eye(3))
+    assert [Protection(name).k for name in ("none", "pitch", "roll+yaw", "all")] == [0, 1, 2, 3]
+    assert Protection(np.zeros((3, 0))).k == 0
+
+
+def test_the_paper_s_tilted_axis_is_made_unit_and_its_angle_told():
+    protection = Protection([0.5, 0, 0.866])
+    assert abs(np.linalg.norm(protection.U_c) - 1) <= EPS
+    assert protection.correction == 0.0  # scaling turns nothing
+    assert "30.0007 deg from yaw" in protection.describe()
+
+
+def unit_vectors():
+    return (
+        arrays(float, 3, elements=st.floats(-1, 1))
+        .filter(lambda v: np.linalg.norm(v) > 0.1)
+        .map(lambda v: v / np.linalg.norm(v))
+    )
+
+
+@given(unit_vectors(), unit_vectors(), st.floats(-9e-4, 9e-4), st.floats(-4e-4, 4e-4), st.integers(1, 3))
+def test_nearly_orthonormal_becomes_orthonormal_to_machine_precision(a, b, stretch, shear, k):
+    second = np.cross(a, b)
+    if np.linalg.norm(second) < 0.1:
+        return
+    second /= np.linalg.norm(second)
+    exact = np.column_stack([a, second, np.cross(a, second)])[:, :k]
+    given_axes = exact @ ((1 + stretch) * np.eye(k) + shear * np.ones((k, k)) * (1 - np.eye(k)))
+    protection = Protection(given_axes)
+    assert np.abs(protection.U_c.T @ protection.U_c - np.eye(k)).max() <= 4 * EPS
+    # The span stays, and the correction is the largest angle between a given direction and the one used.
+    np.testing.assert_allclose(
+        protection.U_c @ protection.U_c.T @ given_axes, given_axes, atol=2e-15 if k == 3 else 1e-14
+    )
+    cosines = np.sum(given_axes * protection.U_c, axis=0) / np.linalg.norm(given_axes, axis=0)
+    assert protection.correction == pytest.approx(np.arccos(np.clip(cosines, -1, 1)).max(), abs=3e-8)
+
+
+@pytest.mark.parametrize(
+    ("axes", "says"),
+    [
+        ([0, 0, 0], "direction 1 of U_c is zero; drop it"),
+        ([0, 0, 2], r"has length 2; did you mean \(0, 0, 1\)"),
+        ([0, 0, 1.002], "has length 1.002"),
+        ([0, np.nan, 1], "is not finite"),
+        (np.eye(3)[:, [0, 0]], "directions 1 and 2 of U_c are the same"),
+        (np.column_stack([[1, 0, 0], [np.sqrt(0.5), np.sqrt(0.5), 0]]), "stand at 45 deg; make them orthogonal"),
+        (np.eye(4)[:3], "k = 4 directions; space has 3"),
+        ([[1, 0, 0], [0, 0, 1]], r"shape \(2, 3\).*its transpose would do"),
+        (np.zeros((3, 3, 3)), r"shape \(3, 3, 3\)"),
+        ([1, 0], r"shape \(2,\)"),
+        ("roll and yaw", "unknown protection 'roll and yaw': give a name"),
+        ([object()], "cannot be read as numbers"),
+    ],
+)
+def test_what_is_no_protection_is_refused(axes, says):
+    with pytest.raises(ssm.InputError, match=says):
+        Protection(axes)
+
+
+def test_an_unknown_frame_is_refused():
+    with pytest.raises(ssm.InputError, match="frame is 'base' or 'inertial', not 'world'"):
+        Protection("yaw", frame="world")
+
+
+def test_parsing_one_word():
+    np.testing.assert_array_equal(Protection.parse("roll+yaw").U_c, Protection("roll+yaw").U_c)
+    np.testing.assert_array_equal(Protection.parse("1,0,0;0,0,1").U_c, Protection("roll+yaw").U_c)
+    np.testing.assert_array_equal(Protection.parse("0.5,0,0.866").U_c, Protection([0.5, 0, 0.866]).U_c)
+    np.testing.assert_array_equal(Protection.parse("1e0,0,0").U_c, Protection("roll").U_c)
+    assert Protection.parse("yaw@inertial").frame == "inertial"
+    for text, says in (
+        ("yew", "unknown protection 'yew'"),
+        ("1,0", "shape"),
+        ("1,0,0;1", "cannot read"),
+        ("nan,0,1", "finite"),
+    ):
+        with pytest.raises(ssm.InputError, match=says):
+            Protection.parse(text)
+
+
+@pytest.mark.parametrize("frame", ["base", "inertial"])
+@pytest.mark.parametrize("axes", ["none", "yaw", "roll+yaw", "all"])
+def test_projector_and_basis(robot, rng, axes, frame):
+    protection = Protection(axes, frame)
+    coupling = robot.coupling(random_state(robot, rng))
+    J_sub, N, Z = protection.J_sub(coupling), protection.N_sub(coupling), protection.null_space_basis(coupling)
+    n = robot.n_joints
+    turn = coupling.base_rotation if frame == "inertial" else np.eye(3)
+    np.testing.assert_allclose(J_sub, protection.U_c.T @ turn @ coupling.J_rc, atol=1e-15)
+    # The paper's projector, symmetric and idempotent.
+    expected = np.eye(n) - (np.linalg.pinv(J_sub) @ J_sub if protection.k else 0)
+    np.testing.assert_allclose(N, expected, atol=1e-12)
+    np.testing.assert_allclose(N, N.T, atol=1e-15)
+    np.testing.assert_allclose(N @ N, N, atol=1e-14)
+    np.testing.assert_allclose(Z.T @ Z, np.eye(Z.shape[1]), atol=1e-14)
+    assert Z.shape == (n, n - min(protection.k, n))
+    assert np.abs(J_sub @ Z).max(initial=0) <= 8 * EPS * np.linalg.norm(J_sub)
+    # The matrices do not depend on the axes in which the coupling is written.
+    np.testing.assert_allclose(
+        protection.J_sub(coupling.inertial()), J_sub, atol=1e-14 * max(1, np.abs(J_sub).max(initial=0))
+    )
+
+
+def test_protected_directions_are_fixed_in_their_frame(ets_vii, rng):
+    pose = pin.SE3(pin.rpy.rpyToMatrix(0, 0, np.pi / 2), np.zeros(3))
+    coupling = ets_vii.coupling(ets_vii.configuration(rng.uniform(-1, 1, 6), pose))
+    # With the base turned by 90 deg about z, inertial x is the base's -y.
+    np.testing.assert_allclose(
+        Protection("roll", "inertial").J_sub(coupling), -Protection("pitch").J_sub(coupling), atol=1e-16
+    )
