@@ -1,0 +1,1 @@
+"""The selective law and the compiled algebra that it stands on."""
