@@ -1,0 +1,1 @@
+"""Motions under a law, and the record of a motion."""

@@ -1,0 +1,219 @@
+"""The record of a motion: an `xarray.Dataset` that says what each number is and that survives a round trip to disk."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import pinocchio as pin
+import xarray as xr
+from numpy.typing import NDArray
+
+from ssm_decouple.control import kernel
+from ssm_decouple.control.law import SelectiveLaw
+from ssm_decouple.errors import FileError
+from ssm_decouple.files import written_whole
+
+Floats = NDArray[np.float64]
+
+STALL_PROGRESS = 0.05  # of the error, within one time constant 1 / k_p, in which an unhindered law sheds 63 %
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a motion ended.
+
+    Attributes:
+        name: "converged" (the error stays within the tolerance), "stalled" (it stopped shrinking outside it) or
+            "running" (neither, when the time was over).
+        time: When it came within the tolerance for good, or when it stopped making progress, or the end, s.
+        error: Distance to the target at the end, m.
+    """
+
+    name: Literal["converged", "stalled", "running"]
+    time: float
+    error: float
+
+
+def judge(time: Floats, error: Floats, tolerance: float, time_constant: float) -> Outcome:
+    """Say how a motion ended.
+
+    A motion is stalled when, to its end, the error never again shrinks by STALL_PROGRESS within one time constant.
+
+    Args:
+        time: Sample times (m,), s.
+        error: Distances to the target (m,), m.
+        tolerance: Distance, m, within which the end-effector has arrived.
+        time_constant: 1 / k_p, s.
+
+    Returns:
+        The outcome.
+    """
+    if error[-1] <= tolerance:
+        outside = np.flatnonzero(error > tolerance)
+        return Outcome("converged", float(time[outside[-1] + 1] if outside.size else time[0]), float(error[-1]))
+    earlier = np.searchsorted(time, time - time_constant * (1 + 1e-9))
+    complete = time - time[0] >= time_constant * (1 - 1e-9)
+    shrinking = ~complete | (error <= (1 - STALL_PROGRESS) * error[np.minimum(earlier, np.arange(time.size))])
+    if shrinking[-1]:
+        return Outcome("running", float(time[-1]), float(error[-1]))
+    first = int(np.flatnonzero(shrinking)[-1]) + 1
+    return Outcome("stalled", float(time[earlier[first]]), float(error[-1]))
+
+
+# name: (dimensions, unit, frame, meaning)
+_VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+    "configuration": (("time", "q"), "m, 1, rad", "inertial", "Pinocchio configuration"),
+    "joint_positions": (("time", "joint"), "rad or m", "joint", "joint positions, without jumps at +-pi"),
+    "joint_rates": (("time", "joint"), "rad/s or m/s", "joint", "commanded joint rates"),
+    "base_position": (("time", "axis"), "m", "inertial", "origin of the base frame"),
+    "base_quaternion": (("time", "quaternion"), "1", "base to inertial", "base attitude, x y z w"),
+    "base_rpy": (("time", "axis"), "rad", "base to inertial", "roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll)"),
+    "base_linear_velocity": (("time", "axis"), "m/s", "base", "velocity of the base origin"),
+    "base_angular_velocity": (("time", "axis"), "rad/s", "base", "angular velocity of the base"),
+    "protected_rate": (("time", "protected"), "rad/s", "U_c", "constrained disturbance angular velocity U_c^T omega"),
+    "protected_angle": (("time", "protected"), "rad", "U_c", "rotation about the protected axes, summed over samples"),
+    "end_effector_position": (("time", "axis"), "m", "inertial", "end-effector"),
+    "target_position": (("time", "axis"), "m", "inertial", "where the end-effector should be"),
+    "end_effector_error": (("time",), "m", "", "distance from the end-effector to the target"),
+    "smallest_singular_value": (("time",), "m", "", "smallest singular value of J_g N_sub"),
+    "rate_scale": (("time",), "1", "", "factor that brought the joint rates inside their limits"),
+    "damping": (("time",), "m2", "", "regularising scalar rho, 0 away from singularities"),
+    "linear_momentum": (("time", "axis"), "kg m/s", "inertial", "audit: linear momentum of (q, v)"),
+    "angular_momentum": (("time", "axis"), "kg m2/s", "inertial", "audit: angular momentum about the centre of mass"),
+    "centre_of_mass": (
+        ("time", "axis"),
+        "m",
+        "inertial",
+        "audit: centre of mass of the whole, at rest if all is right",
+    ),
+    "U_c": (("axis", "protected"), "1", "", "protected directions, columns, in the axes that the law's settings name"),
+    "robot_urdf": ((), "", "", "the robot, so that the motion can be drawn anywhere"),
+}
+
+
+def build_motion(
+    law: SelectiveLaw, time: Floats, configurations: Floats, values: Floats, targets: Floats
+) -> xr.Dataset:
+    """Assemble the record of a motion from its samples.
+
+    Args:
+        law: The law that commanded it.
+        time: Sample times (m,), s.
+        configurations: Configurations (m, nq).
+        values: The law's output arrays (m, law.size).
+        targets: Target positions (m, 3), m, inertial axes.
+
+    Returns:
+        The motion; its variables are listed in the documentation of `simulate`.
+    """
+    from scipy.spatial.transform import Rotation
+
+    robot, model = law.robot, law.robot.model
+    n, k, m = robot.n_joints, law.protection.k, time.size
+    results = values[:, 6 + n :]
+    attitude = Rotation.from_quat(configurations[:, 3:7])
+    steps = attitude[:-1].inv() * attitude[1:] if law.protection.frame == "base" else attitude[1:] * attitude[:-1].inv()
+    turned = steps.as_rotvec() @ law.protection.U_c if m > 1 else np.zeros((0, k))
+    momenta, centres = np.empty((m, 6)), np.empty((m, 3))
+    data = model.createData()
+    total, centre = data.hg, data.com[0]
+    for i in range(m):
+        pin.computeCentroidalMomentum(model, data, configurations[i], values[i, : 6 + n])
+        momenta[i], centres[i] = total.vector, centre
+
+    arrays = {
+        "configuration": configurations,
+        "joint_positions": _joint_positions(model, configurations),
+        "joint_rates": values[:, 6 : 6 + n],
+        "base_position": configurations[:, :3],
+        "base_quaternion": configurations[:, 3:7],
+        "base_rpy": attitude.as_euler("ZYX")[:, ::-1],
+        "base_linear_velocity": values[:, :3],
+        "base_angular_velocity": values[:, 3:6],
+        "protected_rate": results[:, kernel.PROTECTED_RATE : kernel.PROTECTED_RATE + k],
+        "protected_angle": np.vstack([np.zeros((1, k)), np.cumsum(turned, axis=0)]),
+        "end_effector_position": results[:, kernel.POSITION : kernel.POSITION + 3],
+        "target_position": targets,
+        "end_effector_error": np.linalg.norm(results[:, kernel.ERROR : kernel.ERROR + 3], axis=1),
+        "smallest_singular_value": results[:, kernel.SMALLEST_SINGULAR_VALUE],
+        "rate_scale": results[:, kernel.RATE_SCALE],
+        "damping": results[:, kernel.DAMPING],
+        "linear_momentum": momenta[:, :3],
+        "angular_momentum": momenta[:, 3:],
+        "centre_of_mass": centres,
+        "U_c": law.protection.U_c,
+        "robot_urdf": np.array(robot.urdf, dtype=object),
+    }
+    variables = {}
+    for name, (dimensions, unit, frame, meaning) in _VARIABLES.items():
+        attributes = {"units": unit, "frame": frame, "long_name": meaning}
+        variables[name] = xr.Variable(dimensions, arrays[name], attributes, fastpath=True)
+    coordinates = {
+        "time": ("time", time, {"units": "s"}),
+        "joint": list(robot.joint_names),
+        "axis": ["x", "y", "z"],
+        "protected": list(range(1, k + 1)),
+        "quaternion": ["x", "y", "z", "w"],
+    }
+    return xr.Dataset(variables, coordinates, _attributes(law))
+
+
+def _joint_positions(model: pin.Model, configurations: Floats) -> Floats:
+    positions = np.empty((configurations.shape[0], model.nv - 6))
+    for i, joint in enumerate(model.joints[2:]):
+        first = configurations[:, joint.idx_q]
+        if joint.nq == 1:
+            positions[:, i] = first
+        else:  # a continuous joint holds cosine and sine
+            positions[:, i] = np.unwrap(np.arctan2(configurations[:, joint.idx_q + 1], first))
+    return positions
+
+
+def _attributes(law: SelectiveLaw) -> dict[str, Any]:
+    return {
+        "robot": law.robot.name,
+        "end_effector": law.robot.end_effector,
+        "law": json.dumps(law.describe()),
+        "versions": json.dumps({name: metadata.version(name) for name in ("ssm-decouple", "pin", "numpy", "numba")}),
+    }
+
+
+def save_motion(motion: xr.Dataset, path: str | Path) -> Path:
+    """Write a motion to a netCDF file, whole or not at all.
+
+    Raises:
+        FileError: the place cannot be written.
+    """
+    final = Path(path)
+    with written_whole(final) as temporary:
+        motion.to_netcdf(temporary, engine="h5netcdf")
+    return final
+
+
+def load_motion(path: str | Path) -> xr.Dataset:
+    """Read a motion from a netCDF file.
+
+    Raises:
+        FileError: no such file, not netCDF, or not a motion of this package; what is missing is named.
+    """
+    if not Path(path).is_file():
+        raise FileError(f"no motion at '{path}': not a file")
+    try:
+        with xr.open_dataset(path, engine="h5netcdf") as opened:
+            motion = opened.load()
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise FileError(f"'{path}' is not a netCDF file: {error}") from error
+    missing = [name for name in _VARIABLES if name not in motion.variables]
+    if missing:
+        raise FileError(
+            f"'{path}' is netCDF but not a motion: it lacks {', '.join(missing[:4])}{', ..' if missing[4:] else ''}"
+        )
+    for name, (dimensions, *_) in _VARIABLES.items():
+        if motion[name].dims != dimensions:
+            raise FileError(f"'{path}' is no motion: {name} has dimensions {motion[name].dims}, expected {dimensions}")
+    return motion
