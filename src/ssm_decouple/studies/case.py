@@ -1,0 +1,289 @@
+"""A case: which robot, from where, to where, protecting what, under which law. Read from TOML."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import sys
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import xarray as xr
+from numpy.typing import NDArray
+
+from ssm_decouple.control.law import SelectiveLaw
+from ssm_decouple.errors import DecoupleError, InputError
+from ssm_decouple.model.catalogue import load_robot, models
+from ssm_decouple.model.robot import Robot
+from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.simulation.simulate import METHODS, Progress, simulate
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+Floats = NDArray[np.float64]
+
+_FOLDER = Path(__file__).parent / "cases"
+
+# What a case file may hold: table, key, what the value must be, and whether it has to be there.
+_NUMBER, _TEXT, _NUMBERS, _JOINTS, _AXES, _TURNS = (
+    "a number",
+    "a text",
+    "3 numbers",
+    "a list of numbers or a table by joint name",
+    "a name or a list of directions such as [[0, 0, 1]]",
+    "a table of angles by the name of a visual",
+)
+_SCHEMA: dict[str, dict[str, tuple[str, bool]]] = {
+    "": {"title": (_TEXT, False), "robot": (_TEXT, True), "end_effector": (_TEXT, False)},
+    "start": {
+        "joints_deg": (_JOINTS, False),
+        "joints": (_JOINTS, False),
+        "base_position": (_NUMBERS, False),
+        "base_rpy_deg": (_NUMBERS, False),
+    },
+    "target": {"position": (_NUMBERS, True)},
+    "protection": {"axes": (_AXES, True), "frame": (_TEXT, False)},
+    "law": {
+        "gain": (_NUMBER, False),
+        "rate_limit_deg": (_NUMBER, False),
+        "rate_limit": (_NUMBER, False),
+        "damping": (_NUMBER, False),
+        "damping_threshold": (_NUMBER, False),
+    },
+    "simulation": {
+        "duration": (_NUMBER, True),
+        "dt": (_NUMBER, True),
+        "method": (_TEXT, False),
+        "arrival_tolerance": (_NUMBER, False),
+    },
+    "figure": {"turned_deg": (_TURNS, False)},
+}
+
+
+@dataclass(frozen=True)
+class Case:
+    """One motion to simulate. Units are SI and radians.
+
+    Attributes:
+        name: Short name, used for file names.
+        title: One line for tables and figures.
+        robot_source: Catalogue name or URDF path.
+        end_effector: Frame that the task moves; None as in `load_robot`.
+        joints: Start joint positions by joint name or in order, rad or m.
+        base_position: Start position of the base origin (3,), m.
+        base_rpy: Start roll, pitch, yaw of the base (3,), rad.
+        target: Desired end-effector position (3,), m, inertial axes.
+        protection: The case's own protection.
+        law: Further arguments of `SelectiveLaw`: gain, rate_limit, damping, damping_threshold.
+        duration: s.
+        dt: Time between samples, s.
+        simulation: Further arguments of `simulate`: method, arrival_tolerance.
+        turned: Visuals of the root link that the figures show turned about its y axis, rad by name.
+    """
+
+    name: str
+    title: str
+    robot_source: str
+    end_effector: str | None
+    joints: Floats | Mapping[str, float] | None
+    base_position: tuple[float, ...]
+    base_rpy: tuple[float, ...]
+    target: tuple[float, ...]
+    protection: Protection
+    law: Mapping[str, float] = field(default_factory=dict)
+    duration: float = 150.0
+    dt: float = 0.1
+    simulation: Mapping[str, Any] = field(default_factory=dict)
+    turned: Mapping[str, float] = field(default_factory=dict)
+
+    @cached_property
+    def robot(self) -> Robot:
+        """The robot, loaded when first asked for."""
+        return load_robot(self.robot_source, self.end_effector)
+
+    def start(self) -> Floats:
+        """Return the start configuration (nq,)."""
+        pose = pin.SE3(pin.rpy.rpyToMatrix(*self.base_rpy), np.array(self.base_position))
+        return self.robot.configuration(self.joints, pose)
+
+    def make_law(self, protection: Protection | None = None) -> SelectiveLaw:
+        """Return the case's law, with another protection than its own if one is given."""
+        return SelectiveLaw(self.robot, protection or self.protection, **self.law)
+
+    def run(
+        self, protection: Protection | None = None, dt: float | None = None, progress: Progress | None = None
+    ) -> xr.Dataset:
+        """Simulate the case.
+
+        Args:
+            protection: Instead of the case's own.
+            dt: Time between samples, s, instead of the case's own.
+            progress: Called now and then with the share done, 0 to 1.
+
+        Returns:
+            The motion, as `simulate` returns it, with the case's name and title and U_c of the case in its attributes.
+
+        Raises:
+            DecoupleError: the case cannot be run; the message says why.
+        """
+        law = self.make_law(protection)
+        step = self.dt if dt is None else dt
+        motion = simulate(law, self.start(), self.target, self.duration, step, progress=progress, **self.simulation)
+        motion.attrs |= {
+            "case": self.name,
+            "title": self.title,
+            "case_U_c": json.dumps(self.protection.U_c.tolist()),
+            "case_frame": self.protection.frame,
+            "turned": json.dumps(dict(self.turned)),
+        }
+        return motion
+
+
+def cases() -> dict[str, Path]:
+    """Return the cases that come with the package: name to TOML path."""
+    return {path.stem: path for path in sorted(_FOLDER.glob("*.toml"), key=lambda path: (len(path.stem), path.stem))}
+
+
+def load_case(source: str | Path) -> Case:
+    """Read a case: the name of one that comes with the package, or a path to a TOML file.
+
+    Args:
+        source: Name such as "case1", or path. A robot path in the file is taken relative to the file.
+
+    Returns:
+        The case.
+
+    Raises:
+        InputError: no such case, not TOML, an unknown key (the nearest known one is named), a missing key or a value
+            of the wrong kind.
+    """
+    catalogue = cases()
+    path = catalogue.get(str(source), Path(source).expanduser())
+    if not path.is_file():
+        raise InputError(f"'{source}' is neither a file nor one of the cases {', '.join(catalogue)}")
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(f"'{path}' is not TOML: {error}") from error
+    try:
+        return _case(content, path)
+    except DecoupleError as error:
+        raise InputError(f"case '{path}': {error}") from error
+
+
+def _case(content: dict[str, Any], path: Path) -> Case:
+    _validate(content)
+    start, law, simulation = (content.get(table, {}) for table in ("start", "law", "simulation"))
+    axes = content["protection"]["axes"]
+    robot = content["robot"]
+    law_arguments = {
+        key: float(law[key]) for key in ("gain", "rate_limit", "damping", "damping_threshold") if key in law
+    }
+    if "rate_limit_deg" in law:
+        if "rate_limit" in law:
+            raise InputError("give rate_limit_deg or rate_limit, not both")
+        law_arguments["rate_limit"] = float(np.deg2rad(law["rate_limit_deg"]))
+    return Case(
+        name=path.stem,
+        title=content.get("title", path.stem),
+        robot_source=robot if robot in models() else str(path.parent / Path(robot).expanduser()),
+        end_effector=content.get("end_effector"),
+        joints=_joints(start),
+        base_position=tuple(map(float, start.get("base_position", (0, 0, 0)))),
+        base_rpy=tuple(map(float, np.deg2rad(start.get("base_rpy_deg", (0, 0, 0))))),
+        target=tuple(map(float, content["target"]["position"])),
+        protection=Protection(
+            axes if isinstance(axes, str) else _directions(axes), content["protection"].get("frame", "base")
+        ),
+        law=law_arguments,
+        duration=float(simulation["duration"]),
+        dt=float(simulation["dt"]),
+        simulation={key: simulation[key] for key in ("method", "arrival_tolerance") if key in simulation},
+        turned={
+            name: float(np.deg2rad(angle)) for name, angle in content.get("figure", {}).get("turned_deg", {}).items()
+        },
+    )
+
+
+def _joints(start: Mapping[str, Any]) -> Floats | dict[str, float] | None:
+    degrees, plain = start.get("joints_deg"), start.get("joints")
+    if degrees is None or plain is None:
+        given = degrees if degrees is not None else plain
+        factor = np.pi / 180 if degrees is not None else 1.0
+        if given is None:
+            return None
+        if isinstance(given, dict):
+            return {name: factor * value for name, value in given.items()}
+        return factor * np.array(given, dtype=float)
+    if not (isinstance(degrees, dict) and isinstance(plain, dict)) or degrees.keys() & plain.keys():
+        raise InputError("[start]: joints_deg and joints together must be tables by joint name that share none")
+    return {**plain, **{name: float(np.deg2rad(value)) for name, value in degrees.items()}}
+
+
+def _directions(axes: list[Any]) -> Floats:
+    """Turn a case file's directions, one in a row, into the columns of U_c."""
+    rows = np.array(axes if axes and isinstance(axes[0], list) else [axes], dtype=float)
+    if rows.ndim != 2 or rows.shape[1] != 3:
+        raise InputError(f"[protection] axes {axes}: each direction needs 3 numbers")
+    return rows.T
+
+
+def _validate(content: dict[str, Any]) -> None:
+    tables = [name for name in _SCHEMA if name]
+    for key, value in content.items():
+        if key not in _SCHEMA[""] and key not in tables:
+            raise InputError(_unknown("key", key, [*_SCHEMA[""], *tables]))
+        if key in tables and not isinstance(value, dict):
+            raise InputError(f"'{key}' must be a table: write [{key}] on a line of its own")
+    for table, keys in _SCHEMA.items():
+        values = content.get(table, {}) if table else {k: v for k, v in content.items() if k not in tables}
+        place = f"[{table}] " if table else ""
+        for key, value in values.items():
+            if key not in keys:
+                raise InputError(f"{place}{_unknown('key', key, list(keys))}")
+            if not _fits(value, keys[key][0]):
+                raise InputError(f"{place}{key} is {value!r}; it must be {keys[key][0]}")
+        missing = [key for key, (_, needed) in keys.items() if needed and key not in values]
+        if missing:
+            raise InputError(f"{place}{missing[0]} is missing")
+    method = content["simulation"].get("method", METHODS[0])
+    if method not in METHODS:
+        raise InputError(f"[simulation] {_unknown('method', method, list(METHODS))}")
+
+
+def _unknown(kind: str, word: str, known: list[str]) -> str:
+    nearest = difflib.get_close_matches(word, known, 1, 0.5)
+    return f"unknown {kind} '{word}'" + (
+        f"; did you mean '{nearest[0]}'?" if nearest else f"; known: {', '.join(known)}"
+    )
+
+
+def _fits(value: Any, kind: str) -> bool:
+    def number(x: Any) -> bool:
+        return isinstance(x, int | float) and not isinstance(x, bool)
+
+    if kind == _NUMBER:
+        return number(value)
+    if kind == _TEXT:
+        return isinstance(value, str)
+    if kind == _NUMBERS:
+        return isinstance(value, list) and len(value) == 3 and all(map(number, value))
+    if kind == _TURNS:
+        return isinstance(value, dict) and all(map(number, value.values()))
+    if kind == _AXES:
+        return isinstance(value, str) or (
+            isinstance(value, list) and all(number(x) or (isinstance(x, list) and all(map(number, x))) for x in value)
+        )
+    return (
+        all(map(number, value.values() if isinstance(value, dict) else value))
+        if isinstance(value, dict | list)
+        else False
+    )

@@ -1,0 +1,210 @@
+"""One case under no protection, its own protection and full reactionless control, side by side."""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import xarray as xr
+
+from ssm_decouple.files import written_whole
+from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.studies.case import Case
+
+LAWS = ("none", "selective", "reactionless")
+UNDAMPED = ", undamped"  # behind a law's name: the same with rho = 0
+
+
+@dataclass(frozen=True)
+class Summary:
+    """A motion in figures; angles are degrees here, as everything in it is for people to read.
+
+    Attributes:
+        case: Name of the case.
+        robot: Name of the robot.
+        law: "none", "selective" or "reactionless", followed by ", undamped" where rho is zero.
+        k: Protected directions.
+        outcome: "converged", "stalled" or "running".
+        outcome_time_s: When it arrived for good, or stopped making progress.
+        start_distance_m: End-effector to target at the start.
+        final_error_m: The same at the end.
+        final_position_m: Where the end-effector is at the end, inertial axes.
+        w_sub_max_rad_s: Largest base angular velocity about any of the case's protected directions.
+        protected_angle_deg: Largest rotation from the start about any of them, summed over the samples.
+        roll_deg: Base roll, peak to peak.
+        pitch_deg: Base pitch, peak to peak.
+        yaw_deg: Base yaw, peak to peak.
+        sigma_min_m: Smallest singular value of J_g N_sub over the motion.
+        sigma_min_time_s: When.
+        damped_share: Share of the samples in which rho was above zero.
+        rate_limited_share: Share of the samples in which the rates were scaled down to the limits.
+        joint_travel_deg: Joint rates' norm integrated over time.
+        centre_of_mass_drift_m: How far the centre of mass wandered: the integrator's error, zero in physics.
+    """
+
+    case: str
+    robot: str
+    law: str
+    k: int
+    outcome: str
+    outcome_time_s: float
+    start_distance_m: float
+    final_error_m: float
+    final_position_m: tuple[float, float, float]
+    w_sub_max_rad_s: float
+    protected_angle_deg: float
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+    sigma_min_m: float
+    sigma_min_time_s: float
+    damped_share: float
+    rate_limited_share: float
+    joint_travel_deg: float
+    centre_of_mass_drift_m: float
+
+
+def summarise(motion: xr.Dataset, law: str) -> Summary:
+    """Return a motion in figures.
+
+    Args:
+        motion: A motion of a case, from `Case.run`.
+        law: What the row is called.
+    """
+    time, error = motion.time.values, motion.end_effector_error.values
+    rate, angle = disturbance(motion)
+    swing = np.rad2deg(np.ptp(motion.base_rpy.values, axis=0))
+    sigma = motion.smallest_singular_value.values
+    speed = np.linalg.norm(motion.joint_rates.values, axis=1)
+    drift = motion.centre_of_mass.values - motion.centre_of_mass.values[0]
+    x, y, z = (float(value) for value in motion.end_effector_position.values[-1])
+    return Summary(
+        case=motion.attrs["case"],
+        robot=motion.attrs["robot"],
+        law=law,
+        k=motion.sizes["protected"],
+        outcome=motion.attrs["outcome"],
+        outcome_time_s=float(motion.attrs["outcome_time"]),
+        start_distance_m=float(error[0]),
+        final_error_m=float(error[-1]),
+        final_position_m=(x, y, z),
+        w_sub_max_rad_s=float(np.abs(rate).max(initial=0.0)),
+        protected_angle_deg=float(np.rad2deg(np.abs(angle).max(initial=0.0))),
+        roll_deg=float(swing[0]),
+        pitch_deg=float(swing[1]),
+        yaw_deg=float(swing[2]),
+        sigma_min_m=float(sigma.min()),
+        sigma_min_time_s=float(time[sigma.argmin()]),
+        damped_share=float(np.mean(motion.damping.values > 0)),
+        rate_limited_share=float(np.mean(motion.rate_scale.values < 1)),
+        joint_travel_deg=float(np.rad2deg(np.sum(speed[:-1] * np.diff(time)))),
+        centre_of_mass_drift_m=float(np.linalg.norm(drift, axis=1).max()),
+    )
+
+
+def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Return rate (m, k), rad/s, and angle (m, k), rad, about the directions that the motion's case protects.
+
+    Under the case's own protection these are the motion's protected_rate and protected_angle; under another they say
+    what the same directions suffer.
+    """
+    from scipy.spatial.transform import Rotation
+
+    U_c, frame = np.array(json.loads(motion.attrs["case_U_c"])).reshape(3, -1), motion.attrs["case_frame"]
+    if np.array_equal(U_c, motion.U_c.values) and frame == json.loads(motion.attrs["law"])["frame"]:
+        return motion.protected_rate.values, motion.protected_angle.values
+    attitude, omega = Rotation.from_quat(motion.base_quaternion.values), motion.base_angular_velocity.values
+    steps = attitude[:-1].inv() * attitude[1:] if frame == "base" else attitude[1:] * attitude[:-1].inv()
+    rate = (omega if frame == "base" else attitude.apply(omega)) @ U_c
+    return rate, np.vstack([np.zeros((1, U_c.shape[1])), np.cumsum(steps.as_rotvec() @ U_c, axis=0)])
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """One case under several laws.
+
+    Attributes:
+        case: The case.
+        motions: The motions by law: "none", "selective", "reactionless"; where the damping acted in one of them, also
+            the same law undamped, for example "reactionless, undamped".
+    """
+
+    case: Case
+    motions: Mapping[str, xr.Dataset]
+
+    def summaries(self) -> list[Summary]:
+        """Return one row of figures a law."""
+        return [summarise(motion, law) for law, motion in self.motions.items()]
+
+
+def laws_of(case: Case) -> dict[str, Protection]:
+    """Return the protections to compare: none, the case's own, all. One that the case has already is left out."""
+    chosen = {"none": Protection("none"), "selective": case.protection, "reactionless": Protection("all")}
+    if case.protection.k == 0:
+        del chosen["selective"]
+    if case.protection.k == 3:
+        del chosen["reactionless"]
+    return chosen
+
+
+def compare_step_by_step(
+    case: Case, dt: float | None = None, progress: Callable[[str, float], object] | None = None
+) -> Iterator[tuple[str, xr.Dataset]]:
+    """Run a case under each law in turn and give each motion as soon as it is there.
+
+    Args:
+        case: The case.
+        dt: Time between samples, s, instead of the case's own.
+        progress: Called now and then with the law and the share of its motion that is done.
+
+    Yields:
+        The law's name and the motion. Where the damping acted, the same law undamped follows: how a singular system is
+        regularised decides where the arm ends, so both are shown.
+    """
+    undamped = replace(case, law={**case.law, "damping": 0.0})
+
+    def run(law: str, variant: Case, protection: Protection) -> xr.Dataset:
+        return variant.run(protection, dt, None if progress is None else lambda share: progress(law, share))
+
+    for law, protection in laws_of(case).items():
+        motion = run(law, case, protection)
+        yield law, motion
+        if np.any(motion.damping > 0):
+            yield law + UNDAMPED, run(law + UNDAMPED, undamped, protection)
+
+
+def compare(case: Case, dt: float | None = None) -> Comparison:
+    """Run a case under no protection, its own protection and full reactionless control.
+
+    Args:
+        case: The case.
+        dt: Time between samples, s, instead of the case's own.
+
+    Returns:
+        The comparison.
+
+    Raises:
+        DecoupleError: the case cannot be run; the message says why.
+    """
+    return Comparison(case, dict(compare_step_by_step(case, dt)))
+
+
+def write_csv(rows: list[Summary], path: str | Path) -> Path:
+    """Write summaries as a CSV table, whole or not at all.
+
+    Raises:
+        FileError: the place cannot be written.
+    """
+    final = Path(path)
+    with written_whole(final) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file)
+        writer.writerow([column.name for column in fields(Summary)])
+        for row in rows:
+            values = (getattr(row, column.name) for column in fields(Summary))
+            writer.writerow([" ".join(map(repr, value)) if isinstance(value, tuple) else value for value in values])
+    return final
