@@ -1,0 +1,326 @@
+"""The command `ssm-decouple`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+
+import ssm_decouple
+from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError
+
+if TYPE_CHECKING:
+    import xarray as xr
+
+    from ssm_decouple.studies.case import Case
+    from ssm_decouple.studies.comparison import Summary
+
+NOT_ARRIVED = 3
+INTERRUPTED = 130
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Selective decoupling for free-floating space manipulators: the arm reaches its target while the base "
+    "directions that matter do not turn.\n\nStart with [bold]ssm-decouple compare all[/bold].",
+    epilog="Exit status: 0 all well; 1 bad input, one line says what and how to mend it; 2 wrong usage; "
+    f"{NOT_ARRIVED} a motion of 'run' did not reach its target; {INTERRUPTED} interrupted, what was done is kept.",
+)
+
+_CASES = "Names of cases ('ssm-decouple cases' lists them), TOML files, or 'all'."
+_PROTECT = (
+    "Protect this instead of the case's own axes: none, roll, pitch, yaw, all, several as 'roll+yaw', or numbers as "
+    "'0.5,0,0.866' or '1,0,0;0,0,1'; add '@inertial' for inertial axes."
+)
+Cases = Annotated[list[str], typer.Argument(help=_CASES, show_default=False)]
+Output = Annotated[Path, typer.Option("--output", "-o", help="Folder for motions, figures and tables.")]
+TimeStep = Annotated[float | None, typer.Option("--dt", help="Time between samples, s, instead of the case's own.")]
+Protect = Annotated[str | None, typer.Option("--protect", "-p", help=_PROTECT)]
+Damping = Annotated[
+    float | None, typer.Option(help="rho at a singularity, m2, instead of the case's own; 0 for the plain inverse.")
+]
+NoFigures = Annotated[bool, typer.Option("--no-figures", help="Write no figures.")]
+NoProgress = Annotated[bool, typer.Option("--no-progress", help="Show no progress.")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to standard output instead of tables.")]
+
+
+def main() -> None:
+    """Run the command; an expected error is one line on standard error and exit status 1."""
+    warnings.showwarning = _show_warning
+    try:
+        app()
+    except DecoupleError as error:
+        _complain(f"[bold red]error:[/] {_escape(error)}")
+        sys.exit(1)
+
+
+@app.callback(invoke_without_command=True)
+def _version(version: Annotated[bool, typer.Option("--version", help="Print the version.")] = False) -> None:
+    if version:
+        typer.echo(ssm_decouple.__version__)
+        raise typer.Exit
+
+
+@app.command()
+def run(
+    cases: Cases,
+    output: Output = Path("results"),
+    dt: TimeStep = None,
+    protect: Protect = None,
+    damping: Damping = None,
+    no_figures: NoFigures = False,
+    no_progress: NoProgress = False,
+    as_json: AsJson = False,
+) -> None:
+    """Simulate cases under their own protection and write motions and figures.
+
+    Writes OUTPUT/CASE/LAW.nc and the figures beside it. Exit status 3 if one does not reach its target.
+
+    Examples: ssm-decouple run case1; ssm-decouple run my.toml --protect yaw --output somewhere
+    """
+    from ssm_decouple.momentum.protection import Protection
+    from ssm_decouple.studies.comparison import summarise
+
+    protection = None if protect is None else Protection.parse(protect)
+    law = "selective" if protect is None else {"none": "none", "all": "reactionless"}.get(protect, "custom")
+    work = _Work(output, no_figures, as_json)
+    with work.collecting(), _progress(no_progress or as_json) as show:
+        for case in _load(cases, damping):
+            motion = case.run(protection, dt, partial(show, case.name, law))
+            work.keep_motion(case, law, motion)
+            work.draw(case, law, motion)
+            work.rows.append(summarise(motion, law))
+    work.report()
+    if any(row.outcome != "converged" for row in work.rows):
+        raise typer.Exit(NOT_ARRIVED)
+
+
+@app.command()
+def compare(
+    cases: Cases,
+    output: Output = Path("results"),
+    dt: TimeStep = None,
+    damping: Damping = None,
+    no_figures: NoFigures = False,
+    no_progress: NoProgress = False,
+    as_json: AsJson = False,
+) -> None:
+    """Run cases under no protection, their own and full reactionless control, and print one table.
+
+    Where the damping acted, the same law undamped is shown too. Writes OUTPUT/comparison.csv and, for each case,
+    motions, the figures of its own protection and a sheet that compares the laws.
+
+    Examples: ssm-decouple compare all; ssm-decouple compare case2 my.toml --json
+    """
+    from ssm_decouple.studies.comparison import compare_step_by_step, summarise, write_csv
+
+    work = _Work(output, no_figures, as_json)
+    with work.collecting(), _progress(no_progress or as_json) as show:
+        for case in _load(cases, damping):
+            motions = {}
+            for law, motion in compare_step_by_step(case, dt, partial(show, case.name)):
+                motions[law] = motion
+                work.keep_motion(case, law, motion)
+                work.rows.append(summarise(motion, law))
+            show(case.name, "figures", 1.0)
+            own = "selective" if "selective" in motions else next(reversed(motions))
+            work.draw(case, own, motions[own])
+            work.draw_comparison(case, motions)
+    if work.rows:
+        work.files.append(write_csv(work.rows, work.folder / "comparison.csv"))
+    work.report()
+
+
+@app.command()
+def plot(
+    motion: Annotated[Path, typer.Argument(help="A motion, netCDF, as 'run' and 'compare' write them.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Folder; the motion's own if not given.")
+    ] = None,
+) -> None:
+    """Draw the figures of a motion again."""
+    from ssm_decouple.simulation.motion import load_motion
+    from ssm_decouple.viewing.figures import save_figures
+
+    for path in save_figures(load_motion(motion), output or motion.parent, motion.stem):
+        typer.echo(path)
+
+
+@app.command()
+def check(
+    robot: Annotated[str, typer.Argument(help="A URDF file, or the name of a robot of the catalogue.")],
+    as_json: AsJson = False,
+) -> None:
+    """Say what a robot is made of and what is suspicious or impossible in its URDF.
+
+    Exit status 1 if it cannot be used.
+    """
+    from ssm_decouple.model.catalogue import find_urdf
+    from ssm_decouple.model.report import Report
+
+    report = Report.of_file(find_urdf(robot))
+    typer.echo(json.dumps(report.to_dict(), indent=2) if as_json else str(report))
+    if not report.usable:
+        raise typer.Exit(1)
+
+
+@app.command()
+def models(as_json: AsJson = False) -> None:
+    """List the robots that come with the package."""
+    from ssm_decouple.model.catalogue import load_robot
+    from ssm_decouple.model.catalogue import models as catalogue
+
+    paths = catalogue()
+    robots = {name: load_robot(name) for name in paths}
+    if as_json:
+        listed = {name: {"joints": r.n_joints, "mass": r.mass, "urdf": str(paths[name])} for name, r in robots.items()}
+        typer.echo(json.dumps(listed, indent=2))
+        return
+    for name, found in robots.items():
+        typer.echo(f"{name:<16} {found.n_joints} joints  {found.mass:7.1f} kg  {paths[name]}")
+
+
+@app.command()
+def cases(as_json: AsJson = False) -> None:
+    """List the cases that come with the package; copy one to start your own."""
+    from ssm_decouple.studies.case import cases as catalogue
+    from ssm_decouple.studies.case import load_case
+
+    titles = {name: load_case(name).title for name in catalogue()}
+    if as_json:
+        listed = {name: {"title": titles[name], "toml": str(path)} for name, path in catalogue().items()}
+        typer.echo(json.dumps(listed, indent=2))
+        return
+    for name, path in catalogue().items():
+        typer.echo(f"{name:<13} {titles[name]}\n{'':<13} {path}")
+
+
+def _load(names: list[str], damping: float | None) -> list[Case]:
+    from ssm_decouple.studies.case import cases as catalogue
+    from ssm_decouple.studies.case import load_case
+
+    loaded = [load_case(name) for word in names for name in (catalogue() if word == "all" else [word])]
+    twice = {case.name for case in loaded if [other.name for other in loaded].count(case.name) > 1}
+    if twice:
+        raise InputError(f"two cases are called {', '.join(sorted(twice))}: their results would overwrite each other")
+    if damping is None:
+        return loaded
+    return [dataclasses.replace(case, law={**case.law, "damping": damping}) for case in loaded]
+
+
+class _Work:
+    """What a run has produced so far, so that an interruption keeps it."""
+
+    def __init__(self, folder: Path, no_figures: bool, as_json: bool) -> None:
+        from ssm_decouple.files import writable_folder
+
+        self.folder = writable_folder(folder)
+        self.no_figures = no_figures
+        self.as_json = as_json
+        self.rows: list[Summary] = []
+        self.files: list[Path] = []
+        self.interrupted = False
+
+    @contextmanager
+    def collecting(self) -> Iterator[None]:
+        """Turn Ctrl-C into an orderly end: what is done stays, the motion in progress is kept apart."""
+        from ssm_decouple.simulation.simulate import SimulationInterrupted
+
+        try:
+            yield
+        except SimulationInterrupted as stopped:
+            self.interrupted = True
+            from ssm_decouple.simulation.motion import save_motion
+
+            self.files.append(save_motion(stopped.motion, self.folder / "interrupted.nc"))
+        except KeyboardInterrupt:
+            self.interrupted = True
+
+    def keep_motion(self, case: Case, law: str, motion: xr.Dataset) -> None:
+        from ssm_decouple.files import writable_folder
+        from ssm_decouple.simulation.motion import save_motion
+
+        place = writable_folder(self.folder / case.name)
+        self.files.append(save_motion(motion, place / f"{_file_name(law)}.nc"))
+
+    def draw(self, case: Case, law: str, motion: xr.Dataset) -> None:
+        if not self.no_figures:
+            from ssm_decouple.viewing.figures import save_figures
+
+            self.files += save_figures(motion, self.folder / case.name, _file_name(law))
+
+    def draw_comparison(self, case: Case, motions: dict[str, xr.Dataset]) -> None:
+        if not self.no_figures:
+            from ssm_decouple.viewing.figures import comparison
+            from ssm_decouple.viewing.style import save
+
+            self.files += save(comparison(motions), self.folder / case.name, "comparison")
+
+    def report(self) -> None:
+        """Print the rows, the reasons and where the files are; leave with the interrupted status if it was."""
+        from ssm_decouple.viewing.table import explain, terminal_table
+
+        if self.as_json:
+            rows: list[dict[str, Any]] = [dataclasses.asdict(row) for row in self.rows]
+            found = {"interrupted": self.interrupted, "rows": rows, "files": [str(path) for path in self.files]}
+            typer.echo(json.dumps(found, indent=2))
+        elif self.rows:
+            console, table = Console(), terminal_table(self.rows)
+            # Where the terminal is narrower, a line that wraps is easier to read than a number that is cut.
+            console.width = max(console.width, Console(width=1000).measure(table).maximum)
+            console.print(table)
+            for row in self.rows:
+                if (reason := explain(row)) is not None:
+                    console.print(f"{_escape(reason)}", soft_wrap=True, highlight=False)
+            typer.echo(f"\n{len(self.files)} files in {self.folder}")
+        if self.interrupted:
+            _complain(
+                f"[bold yellow]interrupted:[/] {len(self.rows)} finished motions are kept in {_escape(self.folder)}"
+            )
+            raise typer.Exit(INTERRUPTED)
+
+
+def _file_name(law: str) -> str:
+    return law.replace(", ", "_")
+
+
+@contextmanager
+def _progress(hidden: bool) -> Iterator[Any]:
+    columns, console = (TextColumn("{task.description:<40}"), BarColumn(), TimeElapsedColumn()), Console(stderr=True)
+    with Progress(*columns, console=console, transient=True, disable=hidden or not console.is_terminal) as bars:
+        task = bars.add_task("starting", total=1.0)
+
+        def show(case: str, law: str, share: float) -> None:
+            bars.update(task, description=f"{case}, {law}", completed=share)
+
+        yield show
+
+
+def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
+    if issubclass(category, DecoupleWarning):
+        _complain(f"[bold yellow]warning:[/] {_escape(message)}")
+    else:
+        _complain(f"{category.__name__}: {_escape(message)}")
+
+
+def _complain(line: str) -> None:
+    Console(stderr=True).print(line, soft_wrap=True, highlight=False)
+
+
+def _escape(text: object) -> str:
+    from rich.markup import escape
+
+    return escape(str(text))

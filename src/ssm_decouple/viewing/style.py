@@ -1,0 +1,94 @@
+"""How figures look: one column wide, colour-blind safe, the same colour for the same thing everywhere."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import wraps
+from pathlib import Path
+from typing import Any, TypeVar
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ssm_decouple.files import writable_folder, written_whole
+
+T = TypeVar("T")
+
+COLUMN = 3.45  # inches, one column of a two-column page
+PAGE = 7.1
+
+# Okabe and Ito's palette, which readers with any colour vision tell apart.
+AXIS_COLORS = {"roll": "#D55E00", "pitch": "#009E73", "yaw": "#0072B2"}
+PROTECTED = "#CC79A7"
+TARGET = "#000000"
+LAW_LINES: dict[str, dict[str, Any]] = {
+    "none": {"color": "#8C8C8C", "linestyle": (0, (5, 1.5))},
+    "selective": {"color": "#CC79A7", "linestyle": "-"},
+    "reactionless": {"color": "#E69F00", "linestyle": (0, (5, 1.5, 1, 1.5))},
+    "reactionless, undamped": {"color": "#E69F00", "linestyle": (0, (1, 1.5))},
+    "selective, undamped": {"color": "#CC79A7", "linestyle": (0, (1, 1.5))},
+}
+
+_STYLE: Any = {
+    "font.size": 8,
+    "font.family": "sans-serif",
+    "axes.titlesize": 8,
+    "axes.labelsize": 8,
+    "legend.fontsize": 7,
+    "xtick.labelsize": 7,
+    "ytick.labelsize": 7,
+    "axes.grid": True,
+    "grid.color": "#DDDDDD",
+    "grid.linewidth": 0.5,
+    "axes.linewidth": 0.6,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "lines.linewidth": 1.1,
+    "legend.frameon": False,
+    "savefig.dpi": 200,
+    "pdf.fonttype": 42,
+    "figure.constrained_layout.use": True,
+}
+
+
+def joint_colors(count: int) -> list[tuple[float, float, float, float]]:
+    """Return one colour a joint, dark at the shoulder, light at the wrist."""
+    return [mpl.colormaps["viridis"](x) for x in np.linspace(0.0, 0.9, max(count, 1))]
+
+
+def styled(draw: Callable[[T], Figure]) -> Callable[[T], Figure]:
+    """Let a function draw in the package's style, without changing the style of anybody else's figures."""
+
+    @wraps(draw)
+    def wrapper(subject: T) -> Figure:
+        with mpl.rc_context(_STYLE):
+            return draw(subject)
+
+    return wrapper
+
+
+def panels(rows: int, columns: int = 1, width: float = COLUMN, height: float = 1.55) -> tuple[Figure, Sequence[Axes]]:
+    """Return a figure with panels that share their time axis."""
+    figure = Figure(figsize=(width, height * rows + 0.25))
+    axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
+    return figure, list(axes.flat)
+
+
+def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:
+    """Write a figure as PDF and PNG and return the two paths.
+
+    Raises:
+        FileError: the folder cannot be made or written.
+    """
+    place = writable_folder(folder)
+    paths = [place / f"{name}.pdf", place / f"{name}.png"]
+    with mpl.rc_context(_STYLE):
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # laid out once, not again for each file
+        for path in paths:
+            with written_whole(path) as temporary:
+                # Without the date in it the same motion gives the same file.
+                figure.savefig(temporary, metadata={"CreationDate": None} if path.suffix == ".pdf" else None)
+    return paths

@@ -1,0 +1,72 @@
+"""The comparison as a table: in a terminal, and as Markdown for documents."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from rich import box
+from rich.table import Table
+
+from ssm_decouple.studies.comparison import UNDAMPED, Summary
+
+HEADINGS = ("case", "law", "k", "outcome", "left (mm)", "|w_sub| (rad/s)", "roll, pitch, yaw (deg)", "sigma (m)")
+
+
+def cells(row: Summary) -> tuple[str, ...]:
+    """Return a summary as the table's texts, in the order of HEADINGS.
+
+    "left" is the distance to the target at the end, |w_sub| the largest base rate about the directions that the case
+    protects, the angles are peak to peak, sigma is the smallest singular value of J_g N_sub over the motion.
+    """
+    ended = {"converged": "arrived", "stalled": "stalled", "running": "still moving"}[row.outcome]
+    return (
+        row.case,
+        row.law,
+        str(row.k),
+        f"{ended}, {row.outcome_time_s:.0f} s",
+        f"{1e3 * row.final_error_m:.2f}",
+        f"{row.w_sub_max_rad_s:.1e}",
+        f"{row.roll_deg:.3f}  {row.pitch_deg:.3f}  {row.yaw_deg:.3f}",
+        f"{row.sigma_min_m:.1e}",
+    )
+
+
+def terminal_table(rows: Sequence[Summary]) -> Table:
+    """Return the comparison as a table for a terminal, a rule between cases."""
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for heading in HEADINGS:
+        table.add_column(heading, justify="left" if heading in ("case", "law", "outcome") else "right", no_wrap=True)
+    for i, row in enumerate(rows):
+        last = i + 1 == len(rows) or rows[i + 1].case != row.case
+        first = i == 0 or rows[i - 1].case != row.case
+        texts = cells(row)
+        style = {"converged": "green", "stalled": "red"}.get(row.outcome, "yellow")
+        table.add_row(texts[0] if first else "", *texts[1:3], f"[{style}]{texts[3]}[/]", *texts[4:], end_section=last)
+    return table
+
+
+def markdown_table(rows: Sequence[Summary]) -> str:
+    """Return the comparison as a Markdown table."""
+    lines = [
+        f"| {' | '.join(HEADINGS).replace('|w_sub|', 'abs(w_sub)')} |",
+        "|---|---|" + "---:|" * (len(HEADINGS) - 2),
+    ]
+    lines += [f"| {' | '.join(cells(row))} |" for row in rows]
+    return "\n".join(lines)
+
+
+def explain(row: Summary) -> str | None:
+    """Say where and why a motion did not arrive; None if it did."""
+    if row.outcome == "converged":
+        return None
+    x, y, z = row.final_position_m
+    ended = {
+        "stalled": f"stalled at {row.outcome_time_s:.1f} s",
+        "running": f"still moving when the time was over at {row.outcome_time_s:.1f} s",
+    }[row.outcome]
+    damped = "" if row.law.endswith(UNDAMPED) else f", damped for {100 * row.damped_share:.0f} % of the time"
+    return (
+        f"{row.case}, {row.law}: {ended}, {1e3 * row.final_error_m:.0f} mm of {1e3 * row.start_distance_m:.0f} mm "
+        f"left, end-effector at ({x:.3f}, {y:.3f}, {z:.3f}) m. Smallest singular value of J_g N_sub "
+        f"{row.sigma_min_m:.1e} m at {row.sigma_min_time_s:.1f} s{damped}."
+    )

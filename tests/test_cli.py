@@ -1,0 +1,177 @@
+"""The command as a user types it: in a process of its own where status, streams or signals matter."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+import ssm_decouple as ssm
+from ssm_decouple.cli import app
+
+COMMAND = [sys.executable, "-c", "from ssm_decouple.cli import main; main()"]
+
+
+def call(*words, cwd=None):
+    return subprocess.run([*COMMAND, *map(str, words)], capture_output=True, text=True, cwd=cwd, timeout=120)
+
+
+@pytest.fixture
+def short_case(write):
+    text = ssm.cases()["case1"].read_text().replace("duration = 150", "duration = 2")
+    return write(text, "short.toml")
+
+
+def test_help_teaches():
+    shown = CliRunner().invoke(app, ["--help"])
+    assert shown.exit_code == 0
+    for word in ("run", "compare", "models", "check", "plot", "cases", "Exit status"):
+        assert word in shown.output
+    for command in ("run", "compare"):
+        assert "Examples:" in CliRunner().invoke(app, [command, "--help"]).output
+    assert CliRunner().invoke(app, ["--version"]).output.strip() == ssm.__version__
+
+
+def test_run_writes_the_motion_and_the_figures(tmp_path):
+    done = call("run", "case1", "--no-progress", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "arrived, 102 s" in done.stdout
+    names = {path.name for path in (tmp_path / "results" / "case1").iterdir()}
+    assert "selective.nc" in names
+    assert {"selective_joints.pdf", "selective_base.png", "selective_configuration.pdf"} <= names
+    motion = ssm.load_motion(tmp_path / "results" / "case1" / "selective.nc")
+    assert motion.attrs["final_error"] < 1e-3
+    drawn = call("plot", tmp_path / "results" / "case1" / "selective.nc", "--output", tmp_path / "again")
+    assert drawn.returncode == 0
+    assert len(drawn.stdout.splitlines()) == 10
+    assert len(list((tmp_path / "again").iterdir())) == 10
+
+
+def test_a_case_that_does_not_arrive_has_its_own_status(tmp_path):
+    done = call("run", "case1", "--protect", "all", "--no-figures", "-o", tmp_path, "--json")
+    assert done.returncode == 3
+    (row,) = json.loads(done.stdout)["rows"]
+    assert (row["outcome"], row["law"], row["k"]) == ("stalled", "reactionless", 3)
+    assert done.stderr == ""
+
+
+def test_compare_prints_one_table_and_says_why(tmp_path):
+    done = call("compare", "case1", "--no-figures", "-o", tmp_path)
+    assert done.returncode == 0
+    assert "reactionless, undamped" in done.stdout
+    assert "stalled at 52.9 s" in done.stdout
+    assert "Smallest singular value of J_g N_sub" in done.stdout
+    assert (tmp_path / "comparison.csv").read_text().count("\n") == 5
+    assert {path.name for path in (tmp_path / "case1").iterdir()} == {
+        "none.nc",
+        "selective.nc",
+        "reactionless.nc",
+        "reactionless_undamped.nc",
+    }
+
+
+def test_options_reach_the_simulation(short_case, tmp_path):
+    done = call(
+        "run",
+        short_case,
+        "--dt",
+        "0.5",
+        "--protect",
+        "0.5,0,0.866@inertial",
+        "--damping",
+        "0",
+        "--no-figures",
+        "--json",
+        "-o",
+        tmp_path,
+    )
+    motion = ssm.load_motion(json.loads(done.stdout)["files"][0])
+    law = json.loads(motion.attrs["law"])
+    assert motion.sizes["time"] == 5
+    assert (law["frame"], law["damping"], law["k"]) == ("inertial", 0.0, 1)
+
+
+def test_models_cases_and_check():
+    assert json.loads(call("models", "--json").stdout)["ets_vii"]["joints"] == 6
+    assert "ets_vii_flight" in call("models").stdout
+    assert json.loads(call("cases", "--json").stdout)["case2"]["toml"].endswith("case2.toml")
+    assert "Turned solar array" in call("cases").stdout
+    good = call("check", "ets_vii")
+    assert good.returncode == 0
+    assert "nothing suspicious" in good.stdout
+    assert json.loads(call("check", "ets_vii", "--json").stdout)["mass"] == pytest.approx(2690.4)
+
+
+def test_check_of_an_impossible_robot(write):
+    text = ssm.models()["ets_vii"].read_text().replace('<mass value="35"/>', '<mass value="-35"/>')
+    done = call("check", write(text))
+    assert done.returncode == 1
+    assert "impossible  link link_1: mass -35 kg" in done.stdout
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("run", "case9"), "error: 'case9' is neither a file nor one of the cases case1"),
+        (("run", "case1", "--protect", "yow"), "error: unknown protection 'yow'"),
+        (("run", "case1", "--protect", "0,0,2"), "has length 2; did you mean (0, 0, 1)?"),
+        (("run", "case1", "--dt", "0"), "error: dt is 0.0; it must be a positive time, s"),
+        (("run", "case1", "--dt", "200"), "error: dt is 200 s, longer than the duration of 150 s"),
+        (("run", "case1", "--damping", "-1"), "error: damping is -1.0"),
+        (("run", "case1", "case1"), "error: two cases are called case1"),
+        (("check", "nothing.urdf"), "error: 'nothing.urdf' is neither a file nor a robot"),
+        (("plot", "nothing.nc"), "error: no motion at 'nothing.nc': not a file"),
+    ],
+)
+def test_bad_input_is_one_line_and_status_1(tmp_path, words, says):
+    done = call(*words, cwd=tmp_path)
+    assert done.returncode == 1
+    assert says in done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert not list(tmp_path.rglob("*.nc"))
+
+
+def test_an_output_that_cannot_be_written(tmp_path):
+    (tmp_path / "taken").write_text("")
+    done = call("run", "case1", "--output", tmp_path / "taken")
+    assert done.returncode == 1
+    assert "error: cannot write to the folder" in done.stderr
+    assert "choose another with --output" in done.stderr
+
+
+def test_wrong_usage_is_status_2():
+    assert call("run").returncode == 2
+    assert call("fly").returncode == 2
+
+
+def test_a_target_out_of_reach_warns_and_runs(write, tmp_path):
+    text = ssm.cases()["case1"].read_text().replace("[-1.8, -0.3, 1.2]", "[-1.8, -0.3, 9.0]").replace("150  #", "2  #")
+    done = call("run", write(text, "far.toml"), "--no-figures", "-o", tmp_path)
+    assert done.returncode == 3
+    assert "warning: the target (-1.8, -0.3, 9) m is 5.14 m beyond the arm's reach" in done.stderr
+
+
+def test_ctrl_c_keeps_what_is_done(short_case, write, tmp_path):
+    endless = write(short_case.read_text().replace("duration = 2 ", "duration = 1e6 "), "endless.toml")
+    words = [*COMMAND, "run", str(short_case), str(endless), "--no-figures", "-o", str(tmp_path / "out")]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    deadline = time.monotonic() + 60
+    while not (tmp_path / "out" / "short" / "selective.nc").exists() and time.monotonic() < deadline:
+        time.sleep(0.05)
+    time.sleep(1.0)
+    os.kill(process.pid, signal.SIGINT)
+    out, err = process.communicate(timeout=60)
+    assert process.returncode == 130, err
+    assert "interrupted: 1 finished motions are kept" in err
+    assert "short" in out
+    partial = ssm.load_motion(tmp_path / "out" / "interrupted.nc")
+    assert partial.attrs["outcome"] in ("running", "converged")
+    assert 2 < partial.time.values[-1] < 1e6
+    assert not list(Path(tmp_path).rglob("*.part*"))

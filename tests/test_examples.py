@@ -1,0 +1,39 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+EXAMPLES = Path(__file__).parents[1] / "examples"
+PRINTS = {
+    "case1": "converged at 102.0 s, 0.90 mm left",
+    "case2": "converged at 137.2 s, 5.25 mm left",
+    "case3": "case3 | selective | 2 | arrived, 97 s | 0.70",
+    "own_axis": "of 40 directions can be protected",
+    "own_robot": "yaw       converged",
+}
+
+
+def test_every_example_is_tried():
+    assert {path.stem for path in EXAMPLES.glob("*.py")} == PRINTS.keys()
+
+
+@pytest.mark.parametrize("name", PRINTS)
+def test_example(name, tmp_path):
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / f"{name}.py"], capture_output=True, text=True, cwd=tmp_path, timeout=300
+    )
+    assert done.returncode == 0, done.stderr
+    assert PRINTS[name] in done.stdout
+    assert done.stderr == ""
+
+
+def test_own_robot_takes_another_urdf(tmp_path):
+    import ssm_decouple as ssm
+
+    words = [sys.executable, EXAMPLES / "own_robot.py", ssm.example_robot("kinova_description/robots/kinova.urdf")]
+    done = subprocess.run([*words, "j2s6s200_end_effector"], capture_output=True, text=True, cwd=tmp_path, timeout=300)
+    assert done.returncode == 0, done.stderr
+    assert "none      converged" in done.stdout
