@@ -1,0 +1,58 @@
+# `make cases` computes the paper's cases, `make test` runs the tests; both make .venv themselves.
+
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: cases test lint types snippets tables wheel benchmarks clean
+
+cases: .venv/installed
+	$(BIN)/ssm-decouple compare all --output results
+
+test: .venv/installed-dev
+	$(BIN)/python -m pytest
+
+lint: .venv/installed-dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: .venv/installed-dev
+	$(BIN)/mypy
+
+# Every Python block in the documents runs; the tables in them are what the commands print today.
+snippets: .venv/installed-dev
+	$(BIN)/python -m pytest -p no:cacheprovider README.md docs
+	$(BIN)/python docs/tables.py --check
+
+tables: .venv/installed-dev
+	$(BIN)/python docs/tables.py
+
+# Build the wheel, install it in an empty environment and run a case from another folder.
+wheel: .venv/installed-dev
+	rm -rf dist .venv-wheel
+	$(BIN)/python -m build --outdir dist .
+	$(PYTHON) -m venv .venv-wheel
+	.venv-wheel/bin/pip install --quiet dist/*.whl
+	cd $$(mktemp -d) && $(CURDIR)/.venv-wheel/bin/ssm-decouple run case1 --no-progress && ls results/case1
+	rm -rf .venv-wheel
+
+benchmarks: .venv/installed-bench
+	$(BIN)/python benchmarks/control_step.py
+	$(BIN)/python benchmarks/start_up.py
+
+clean:
+	rm -rf .venv .venv-wheel dist results
+
+.venv/bin/python:
+	$(PYTHON) -m venv .venv
+
+.venv/installed: pyproject.toml .venv/bin/python
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
+	touch $@
+
+.venv/installed-dev: pyproject.toml .venv/bin/python
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $@ .venv/installed
+
+.venv/installed-bench: pyproject.toml .venv/bin/python
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
+	touch $@ .venv/installed .venv/installed-dev

@@ -1,0 +1,192 @@
+"""One control step: the law against plain NumPy, Pink with hard constraints, and Pinocchio's bare calls.
+
+All candidates take turns in one process, so that the ratios hold whatever the machine does meanwhile.
+
+    python benchmarks/control_step.py [case1|case2|case3]
+"""
+
+from __future__ import annotations
+
+import statistics
+import sys
+import time
+from collections.abc import Callable
+
+import numpy as np
+import pinocchio as pin
+from numpy.typing import NDArray
+
+import ssm_decouple as ssm
+
+Floats = NDArray[np.float64]
+
+ROUNDS = 25
+ROUND_TIME = 0.02  # s, how long each candidate runs in a round
+
+
+def medians(candidates: dict[str, Callable[[], object]]) -> dict[str, float]:
+    """Return the median time of one call of each candidate, s, measured in turns."""
+    counts = {}
+    for name, call in candidates.items():
+        start, count = time.perf_counter(), 0
+        while time.perf_counter() - start < ROUND_TIME:
+            call()
+            count += 1
+        counts[name] = count
+    times: dict[str, list[float]] = {name: [] for name in candidates}
+    for _ in range(ROUNDS):
+        for name, call in candidates.items():
+            repeat = range(counts[name])
+            start = time.perf_counter()
+            for _ in repeat:
+                call()
+            times[name].append((time.perf_counter() - start) / counts[name])
+    return {name: statistics.median(values) for name, values in times.items()}
+
+
+def plain_numpy(case: ssm.Case, q: Floats) -> Callable[[], dict[str, object]]:
+    """Return the same law in plain NumPy, with the same results, as one would write it from the paper."""
+    robot, law = case.robot, case.make_law()
+    model, data, frame = robot.model, robot.model.createData(), robot.end_effector_id
+    U_c, target, limits, identity = law.protection.U_c, np.array(case.target), law.rate_limits, np.eye(robot.n_joints)
+
+    def step() -> dict[str, object]:
+        pin.computeCentroidalMap(model, data, q)
+        pin.updateFramePlacement(model, data, frame)
+        J = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
+        A_g = data.Ag
+        J_base = -np.linalg.solve(A_g[:, :6], A_g[:, 6:])
+        J_g = (J[:, 6:] + J[:, :6] @ J_base)[:3]
+        J_sub = U_c.T @ J_base[3:]
+        J_g_N = J_g @ (identity - np.linalg.pinv(J_sub) @ J_sub)
+        error = target - data.oMf[frame].translation
+        rates = np.linalg.pinv(J_g_N) @ (law.gain * error)
+        scale = min(1.0, (limits / np.maximum(np.abs(rates), 1e-300)).min())
+        rates = scale * rates
+        return {
+            "joint_rates": rates,
+            "base_twist": J_base @ rates,
+            "protected_rate": J_sub @ rates,
+            "end_effector_error": error,
+            "smallest_singular_value": np.linalg.svd(J_g_N, compute_uv=False)[-1],
+            "rate_scale": scale,
+        }
+
+    return step
+
+
+def pink_step(case: ssm.Case, q: Floats) -> Callable[[], Floats]:
+    """Return the same velocity problem as Pink states it: zero momentum and zero protected rate as hard constraints."""
+    import pink
+    from pink.tasks import Task
+
+    robot, law = case.robot, case.make_law()
+    target, U_c, frame = np.array(case.target), law.protection.U_c, robot.end_effector_id
+    model, data = robot.model, robot.model.createData()
+    select = np.hstack([np.zeros((law.protection.k, 3)), U_c.T, np.zeros((law.protection.k, robot.n_joints))])
+
+    class Position(Task):  # type: ignore[misc]
+        def __repr__(self) -> str:
+            return "Position()"
+
+        def compute_error(self, configuration: pink.Configuration) -> Floats:
+            return configuration.data.oMf[frame].translation - target
+
+        def compute_jacobian(self, configuration: pink.Configuration) -> Floats:
+            return pin.getFrameJacobian(model, configuration.data, frame, pin.LOCAL_WORLD_ALIGNED)[:3]
+
+    class Momentum(Task):  # type: ignore[misc]
+        def __repr__(self) -> str:
+            return "Momentum()"
+
+        def compute_error(self, configuration: pink.Configuration) -> Floats:
+            return np.zeros(6 + law.protection.k)
+
+        def compute_jacobian(self, configuration: pink.Configuration) -> Floats:
+            pin.computeCentroidalMap(model, configuration.data, configuration.q)
+            return np.vstack([configuration.data.Ag, select])
+
+    dt = 0.1
+    task, constraint = Position(cost=np.ones(3), gain=law.gain * dt), Momentum(cost=np.ones(6 + law.protection.k))
+    configuration = pink.Configuration(model, data, q)
+
+    def step() -> Floats:
+        configuration.update(q)
+        return pink.solve_ik(
+            configuration,
+            [task],
+            dt,
+            solver="daqp",
+            damping=1e-9,
+            limits=[],
+            constraints=[constraint],
+            safety_break=False,
+        )
+
+    return step
+
+
+def bare_pinocchio(robot: ssm.Robot, q: Floats) -> Callable[[], object]:
+    """Return the floor: the Pinocchio calls that any such law needs, from Python, and nothing else."""
+    model, data, frame = robot.model, robot.model.createData(), robot.end_effector_id
+
+    def step() -> object:
+        pin.computeCentroidalMap(model, data, q)
+        pin.updateFramePlacement(model, data, frame)
+        return pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
+
+    return step
+
+
+def main(name: str) -> None:
+    """Check that all answer the same question, then time them and print the table."""
+    case = ssm.load_case(name)
+    law, q, target = case.make_law(), case.start(), np.array(case.target)
+    out, at_rest = np.empty(law.size), np.zeros(3)
+    plain, floor = plain_numpy(case, q), bare_pinocchio(case.robot, q)
+    candidates: dict[str, Callable[[], object]] = {
+        "Pinocchio's bare calls": floor,
+        "law.evaluate(q, target, velocity, out)": lambda: law.evaluate(q, target, at_rest, out),
+        "law(q, target)": lambda: law(q, target),
+        "plain NumPy with pinv": plain,
+    }
+    command = law(q, target)
+    difference = np.abs(np.asarray(plain()["joint_rates"]) - command.joint_rates).max()
+    print(f"{name}, {case.robot.name}, k = {law.protection.k}: plain NumPy differs by {difference:.1e} rad/s")
+    try:
+        pink = pink_step(case, q)
+    except ImportError:
+        print("Pink is not installed (pip install 'ssm-decouple[bench]'): left out")
+    else:
+        candidates["Pink, hard constraints, DAQP"] = pink
+        v = np.asarray(pink())
+        reached = case.robot.coupling(q).J_gt @ v[6:]
+        asked = law.gain * command.end_effector_error
+        print(
+            f"Pink: end-effector velocity differs from the one asked for by {np.abs(reached - asked).max():.1e} m/s, "
+            f"protected rate {np.abs(law.protection.U_c.T @ v[3:6]).max():.1e} rad/s"
+        )
+    times = medians(candidates)
+    whole, array = times["law(q, target)"], times["law.evaluate(q, target, velocity, out)"]
+    base = times["Pinocchio's bare calls"]
+    print(f"\n{'median of ' + str(ROUNDS) + ' rounds':<42} {'us':>8} {'/ floor':>9} {'/ law(..)':>10}")
+    for label, value in times.items():
+        print(f"{label:<42} {1e6 * value:8.2f} {value / base:9.2f} {value / whole:10.2f}")
+    print(f"\nlaw(q, target) is {times['plain NumPy with pinv'] / whole:.1f} times faster than plain NumPy", end="")
+    if "Pink, hard constraints, DAQP" in times:
+        print(f", {times['Pink, hard constraints, DAQP'] / whole:.1f} times faster than Pink", end="")
+    print(f",\nand takes {whole / base:.2f} times the bare Pinocchio calls; its array form {array / base:.2f} times.")
+
+    for _ in range(3):
+        case.run()
+    runs = []
+    for _ in range(15):
+        start = time.perf_counter()
+        case.run()
+        runs.append(time.perf_counter() - start)
+    steps = round(case.duration / case.dt)
+    print(f"\nThe whole case, {steps} steps with its record: {1e3 * statistics.median(runs):.1f} ms.")
+
+
+if __name__ == "__main__":
+    main(sys.argv[1] if len(sys.argv) > 1 else "case1")
