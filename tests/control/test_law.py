@@ -8,7 +8,7 @@ from fractions import Fraction
 import numpy as np
 import pinocchio as pin
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from random_robots import random_robot, random_state
 
@@ -177,7 +177,8 @@ def test_the_protected_rate_is_rounding_next_to_a_singularity(ets_vii, bend, dam
 
 
 @given(st.integers(0, 10**6), st.integers(1, 3), st.sampled_from(["base", "inertial"]))
-@settings(max_examples=150, deadline=None)
+@example(269276, 3, "base")  # J_sub so ill-conditioned that taking out the leak lifts a rate above its limit
+@settings(max_examples=150)
 def test_any_protection_any_state(seed, k, frame):
     """With J_rc formed by another route, the protected rate is the rounding of J_rc itself."""
     rng = np.random.default_rng(seed)
@@ -228,7 +229,14 @@ def test_the_kernel_uncompiled_gives_the_same(robot, rng, axes):
 
 def uncompiled_command(*arguments):
     """Run the kernel with every function that it calls uncompiled too."""
-    names = ("base_twist_map", "point_velocity_map", "reflect", "apply_reflection", "orthogonalise_columns")
+    names = (
+        "base_twist_map",
+        "point_velocity_map",
+        "reflect",
+        "apply_reflection",
+        "orthogonalise_columns",
+        "scale_to_limits",
+    )
     compiled = {name: getattr(kernel, name) for name in names}
     try:
         for name, function in compiled.items():

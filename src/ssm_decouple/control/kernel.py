@@ -214,6 +214,23 @@ def orthogonalise_columns(B: Floats, V: Floats) -> float:
     return np.sqrt(shortest)
 
 
+@compiled
+def scale_to_limits(q_dot: Floats, columns: Floats) -> float:
+    """Scale q_dot (n,) as a whole, in place, to inside every joint's limit; return the factor, 1 if it was inside.
+
+    Clipping joint by joint would leave null(J_sub).
+    """
+    factor = 1.0
+    for j in range(q_dot.shape[0]):
+        size = abs(q_dot[j])
+        if size * factor > columns[RATE_LIMIT, j]:
+            factor = INSIDE * columns[RATE_LIMIT, j] / size
+    if factor < 1.0:
+        for j in range(q_dot.shape[0]):
+            q_dot[j] *= factor
+    return factor
+
+
 @compiled_for(SELECTIVE_COMMAND)
 def selective_command(
     A_g: Floats,
@@ -360,14 +377,7 @@ def selective_command(
     for i in range(rank - 1, -1, -1):
         apply_reflection(rows, weights, i, i, q_dot)
 
-    # One scale for the whole vector: clipping joint by joint would leave null(J_sub).
-    rate_scale = 1.0
-    for j in range(n):
-        size = abs(q_dot[j])
-        if size * rate_scale > columns[RATE_LIMIT, j]:
-            rate_scale = INSIDE * columns[RATE_LIMIT, j] / size
-    for j in range(n):
-        q_dot[j] *= rate_scale
+    rate_scale = scale_to_limits(q_dot, columns)
 
     # What rounding has left in the protected rows goes, by the same reflections: q_dot -= J_sub^+ J_sub q_dot.
     if rank > 0:
@@ -383,6 +393,8 @@ def selective_command(
             apply_reflection(rows, weights, i, i, leak)
         for j in range(n):
             q_dot[j] -= leak[j]
+        # Where J_sub is ill-conditioned the correction can lift a rate above its limit by more than rounding.
+        rate_scale *= scale_to_limits(q_dot, columns)
 
     total = 0.0
     for j in range(n):

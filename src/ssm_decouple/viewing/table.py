@@ -19,12 +19,13 @@ def cells(row: Summary) -> tuple[str, ...]:
     protects, the angles are peak to peak, sigma is the smallest singular value of J_g N_sub over the motion.
     """
     ended = {"converged": "arrived", "stalled": "stalled", "running": "still moving"}[row.outcome]
+    left = 1e3 * row.final_error_m
     return (
         row.case,
         row.law,
         str(row.k),
         f"{ended}, {row.outcome_time_s:.0f} s",
-        f"{1e3 * row.final_error_m:.2f}",
+        f"{left:.2f}" if left < 100 else f"{left:.0f}",
         f"{row.w_sub_max_rad_s:.1e}",
         f"{row.roll_deg:.3f}  {row.pitch_deg:.3f}  {row.yaw_deg:.3f}",
         f"{row.sigma_min_m:.1e}",

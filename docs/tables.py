@@ -1,0 +1,126 @@
+"""Write the tables and the figure of the documents, or check that the tables are what the package computes.
+
+python docs/tables.py           # rewrite the blocks between <!-- begin NAME --> and <!-- end NAME -->
+python docs/tables.py --check   # exit status 1 if one is out of date
+"""
+
+from __future__ import annotations
+
+import re
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+import ssm_decouple as ssm
+from ssm_decouple.viewing.figures import comparison, configuration
+from ssm_decouple.viewing.style import save
+from ssm_decouple.viewing.table import explain, markdown_table
+
+ROOT = Path(__file__).parents[1]
+DOCUMENTS = (ROOT / "README.md", ROOT / "docs" / "models.md", ROOT / "docs" / "limits.md")
+
+
+def cases_table(suffix: str) -> str:
+    """Return the comparison of cases 1 to 3 on one of the two models, with the reasons of what did not arrive."""
+    rows = [row for i in (1, 2, 3) for row in ssm.compare(ssm.load_case(f"case{i}{suffix}")).summaries()]
+    return markdown_table(rows)
+
+
+def stalls() -> str:
+    """Return where and why reactionless control does not arrive in cases 1 to 3."""
+    rows = [row for i in (1, 2, 3) for row in ssm.compare(ssm.load_case(f"case{i}")).summaries()]
+    return "\n".join(f"- {reason}" for row in rows if (reason := explain(row)))
+
+
+def directions() -> str:
+    """Return how many of many protected directions let the arm arrive in each case."""
+    i = np.arange(100)
+    height, around = (i + 0.5) / i.size, np.pi * (1 + 5**0.5) * i
+    flat = np.sqrt(1 - height**2)
+    spread = np.column_stack([flat * np.cos(around), flat * np.sin(around), height])
+    lines = ["| case | directions that let the arm arrive, of 100 |", "|---|---:|"]
+    for name in ssm.cases():
+        case = ssm.load_case(name)
+        arrived = sum(case.run(ssm.Protection(axis)).attrs["outcome"] == "converged" for axis in spread)
+        lines.append(f"| {name} | {arrived} |")
+    return "\n".join(lines)
+
+
+def patience() -> str:
+    """Return how damped reactionless control ends when it has half an hour."""
+    lines = ["| case | outcome | left (mm) | turns of the wrist roll |", "|---|---|---:|---:|"]
+    for i in (1, 2, 3):
+        case = replace(ssm.load_case(f"case{i}"), duration=1800.0)
+        motion = case.run(ssm.Protection("all"))
+        ended, when, left = (motion.attrs[key] for key in ("outcome", "outcome_time", "final_error"))
+        turns = float(np.ptp(motion.joint_positions.values[:, -1])) / (2 * np.pi)
+        lines.append(f"| {case.name} | {ended} at {when:.0f} s | {1e3 * left:.0f} | {turns:.0f} |")
+    return "\n".join(lines)
+
+
+BLOCKS: dict[str, Callable[[], str]] = {
+    "cases": lambda: cases_table(""),
+    "flight": lambda: cases_table("_flight"),
+    "stalls": stalls,
+    "directions": directions,
+    "patience": patience,
+}
+
+
+NUMBER = re.compile(r"-?\d+(?:\.\d+)?(?:e-\d+)?")
+
+
+def agree(old: str, new: str) -> bool:
+    """Say whether two blocks tell the same: equal words, and numbers within 3 %.
+
+    Another processor rounds otherwise, and a motion that chatters at a singularity carries that into the third digit;
+    numbers with an exponent are rounding themselves, or singular values of such a motion.
+    """
+    if NUMBER.sub("#", old) != NUMBER.sub("#", new):
+        return False
+    pairs = zip(NUMBER.findall(old), NUMBER.findall(new), strict=True)
+    return all("e" in b or abs(float(a) - float(b)) <= 0.03 * abs(float(b)) + 2e-3 for a, b in pairs)
+
+
+def draw() -> None:
+    """Write the figures that the documents show."""
+    folder = ROOT / "docs" / "images"
+    folder.mkdir(exist_ok=True)
+    with tempfile.TemporaryDirectory() as scratch:
+        save(comparison(ssm.compare(ssm.load_case("case1")).motions), scratch, "case1_comparison")
+        save(configuration(ssm.load_case("case2").run()), scratch, "case2_configuration")
+        for path in Path(scratch).glob("*.png"):
+            shutil.copy(path, folder / path.name)
+
+
+def main(check: bool) -> int:
+    """Rewrite or check every block; return the exit status."""
+    made: dict[str, str] = {}
+    stale = []
+    for document in DOCUMENTS:
+        text = document.read_text(encoding="utf-8")
+        for name in re.findall(r"<!-- begin (\w+) -->", text):
+            made.setdefault(name, BLOCKS[name]())
+            pattern = rf"(<!-- begin {name} -->\n\n)(.*?)(\n\n<!-- end {name} -->)"
+            old = re.search(pattern, text, re.DOTALL)
+            if old is None:
+                raise SystemExit(f"{document}: block '{name}' has no end, or no blank lines about it")
+            if not (agree(old[2], made[name]) if check else old[2] == made[name]):
+                stale.append(f"{document.relative_to(ROOT)}: {name}")
+                text = text[: old.start(2)] + made[name] + text[old.end(2) :]
+        if not check:
+            document.write_text(text, encoding="utf-8")
+    if not check:
+        draw()
+    for block in stale:
+        print(f"{'out of date' if check else 'rewritten'}: {block}")
+    return int(check and bool(stale))
+
+
+if __name__ == "__main__":
+    sys.exit(main("--check" in sys.argv[1:]))
