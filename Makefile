@@ -46,10 +46,12 @@ clean:
 	$(PYTHON) -m venv .venv
 
 .venv/installed: pyproject.toml .venv/bin/python
+	@echo "installing into .venv, a minute or so"
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable .
 	touch $@
 
 .venv/installed-dev: pyproject.toml .venv/bin/python
+	@echo "installing into .venv, two minutes or so"
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $@ .venv/installed
 

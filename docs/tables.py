@@ -2,12 +2,14 @@
 
 python docs/tables.py           # rewrite the blocks between <!-- begin NAME --> and <!-- end NAME -->
 python docs/tables.py --check   # exit status 1 if one is out of date
+python docs/tables.py speed     # rewrite the timings, which no check holds: machines differ
 """
 
 from __future__ import annotations
 
 import re
 import shutil
+import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
@@ -98,14 +100,24 @@ def draw() -> None:
             shutil.copy(path, folder / path.name)
 
 
-def main(check: bool) -> int:
-    """Rewrite or check every block; return the exit status."""
+def speed() -> str:
+    """Return what the benchmark of one control step prints here."""
+    words = [sys.executable, str(ROOT / "benchmarks" / "control_step.py")]
+    printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
+    return f"```text\n{printed}\n```"
+
+
+def main(check: bool, timings: bool) -> int:
+    """Rewrite or check every block, or rewrite the timings; return the exit status."""
     made: dict[str, str] = {}
     stale = []
     for document in DOCUMENTS:
         text = document.read_text(encoding="utf-8")
         for name in re.findall(r"<!-- begin (\w+) -->", text):
-            made.setdefault(name, BLOCKS[name]())
+            if (name == "speed") != timings:
+                continue
+            if name not in made:
+                made[name] = speed() if timings else BLOCKS[name]()
             pattern = rf"(<!-- begin {name} -->\n\n)(.*?)(\n\n<!-- end {name} -->)"
             old = re.search(pattern, text, re.DOTALL)
             if old is None:
@@ -115,7 +127,7 @@ def main(check: bool) -> int:
                 text = text[: old.start(2)] + made[name] + text[old.end(2) :]
         if not check:
             document.write_text(text, encoding="utf-8")
-    if not check:
+    if not check and not timings:
         draw()
     for block in stale:
         print(f"{'out of date' if check else 'rewritten'}: {block}")
@@ -123,4 +135,4 @@ def main(check: bool) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main("--check" in sys.argv[1:]))
+    sys.exit(main("--check" in sys.argv[1:], "speed" in sys.argv[1:]))

@@ -302,9 +302,14 @@ def _progress(hidden: bool) -> Iterator[Any]:
     columns, console = (TextColumn("{task.description:<40}"), BarColumn(), TimeElapsedColumn()), Console(stderr=True)
     with Progress(*columns, console=console, transient=True, disable=hidden or not console.is_terminal) as bars:
         task = bars.add_task("starting", total=1.0)
+        told: set[str] = set()
 
         def show(case: str, law: str, share: float) -> None:
-            bars.update(task, description=f"{case}, {law}", completed=share)
+            now = f"{case}, {law}"
+            bars.update(task, description=now, completed=share)
+            if not (hidden or console.is_terminal or now in told):  # in a log, a line for each motion instead of a bar
+                told.add(now)
+                typer.echo(now, err=True)
 
         yield show
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 import xml.etree.ElementTree as ET
 from fractions import Fraction
 
@@ -245,6 +247,23 @@ def uncompiled_command(*arguments):
     finally:
         for name, function in compiled.items():
             setattr(kernel, name, function)
+
+
+def test_it_runs_where_no_compiled_code_can_be_kept():
+    """As in a read-only installation without a home folder, where Numba refuses to cache."""
+    code = """
+import numba
+real = numba.njit
+def refusing(*arguments, cache=False, **options):
+    if cache:
+        raise RuntimeError("cannot cache function: no locator available")
+    return real(*arguments, **options)
+numba.njit = refusing
+import ssm_decouple as ssm
+robot = ssm.load_robot("ets_vii")
+print(ssm.SelectiveLaw(robot, ssm.Protection("yaw"))(robot.configuration(), [1, 0, 2]).rank)
+"""
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout.strip() == "1"
 
 
 def mirrored(urdf: str) -> str:

@@ -23,20 +23,23 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def compiled(function: F) -> F:
-    """Compile with Numba when first called and keep the machine code on disk."""
-    decorated: Any = numba.njit(cache=True, error_model="numpy")(function)
-    return cast(F, decorated)
+def compiled_for(*signature: str) -> Callable[[F], F]:
+    """Compile with Numba and keep the machine code on disk.
 
-
-def compiled_for(signature: str) -> Callable[[F], F]:
-    """Compile with Numba for one signature only: an array of another layout must not start a second compilation."""
+    With a signature it is compiled for that one only: an array of another layout must not start a second compilation.
+    """
 
     def decorate(function: F) -> F:
-        decorated: Any = numba.njit(signature, cache=True, error_model="numpy")(function)
-        return cast(F, decorated)
+        njit: Any = numba.njit
+        try:
+            return cast(F, njit(*signature, cache=True, error_model="numpy")(function))
+        except RuntimeError:  # no folder can be written: compile anew in each process
+            return cast(F, njit(*signature, error_model="numpy")(function))
 
     return decorate
+
+
+compiled = compiled_for()
 
 
 _MATRIX, _ROWS, _VECTOR = "float64[::1, :]", "float64[:, ::1]", "float64[::1]"

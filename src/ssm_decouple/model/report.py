@@ -42,6 +42,7 @@ class Report:
         end_effector: Frame that the tasks move; None where it has to be named.
         reach: From the arm's first joint to the end-effector, pulled straight, m.
         tips: Links at the ends of the arms.
+        frames: Every link, in Pinocchio's order; each can be an end-effector.
         joints: One entry a joint, in the order of the joint rates.
         findings: All that is impossible, suspicious or worth a note.
     """
@@ -55,6 +56,7 @@ class Report:
     end_effector: str | None
     reach: float | None
     tips: tuple[str, ...]
+    frames: tuple[str, ...]
     joints: tuple[JointReport, ...]
     findings: tuple[Finding, ...]
 
@@ -87,7 +89,7 @@ class Report:
 
     @classmethod
     def _unusable(cls, name: str, findings: list[Finding]) -> Report:
-        return cls(name, False, None, None, None, None, None, None, (), (), tuple(findings))
+        return cls(name, False, None, None, None, None, None, None, (), (), (), tuple(findings))
 
     @classmethod
     def _of_loaded(cls, robot: Robot, end_effector: str | None) -> Report:
@@ -112,6 +114,7 @@ class Report:
             end_effector=end_effector,
             reach=robot.reach if end_effector else None,
             tips=tuple(tip_links(root)),
+            frames=tuple(robot.link_names),
             joints=tuple(joints),
             findings=tuple(inspect_urdf(root)),
         )
@@ -140,6 +143,7 @@ class Report:
                 f"  mass          {self.mass:.6g} kg, of which {self.base_mass:.6g} kg fixed to '{self.base_link}'",
                 f"  inertia       {moments} kg m2, principal, whole robot about its centre of mass",
                 f"  end-effector  {named}",
+                f"  frames        {', '.join(self.frames)}",
                 f"  joints        {len(self.joints)}",
             ]
             width = max((len(joint.name) for joint in self.joints), default=0)

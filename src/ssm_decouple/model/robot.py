@@ -40,6 +40,7 @@ class Robot:
         model: The `pinocchio.Model`.
         n_joints: Number n of joints after the root.
         joint_names: Names of those joints, in the order of the joint rates.
+        link_names: Names of the links, each of which is a frame.
         end_effector: Name of the end-effector's frame; the root link where there is no joint.
         end_effector_id: Its Pinocchio frame index.
         rate_limits: Joint rate limits (n,) from the URDF, rad/s or m/s; inf where it gives none.
@@ -72,6 +73,7 @@ class Robot:
         self._neutral: Floats = pin.neutral(self.model)
         self.n_joints: int = self.model.nv - 6
         self.joint_names: tuple[str, ...] = tuple(self.model.names[2:])
+        self.link_names: tuple[str, ...] = tuple(f.name for f in self.model.frames if f.type == pin.FrameType.BODY)
         self.mass: float = pin.computeTotalMass(self.model)
         self.end_effector = self._choose_end_effector(end_effector, tip_links(root), root_link(root))
         self.end_effector_id: int = self.model.getFrameId(self.end_effector)
@@ -81,7 +83,7 @@ class Robot:
         self._refuse_singular_inertia()
 
     def _choose_end_effector(self, wanted: str | None, tips: list[str], root: str) -> str:
-        frames = [frame.name for frame in self.model.frames if frame.type == pin.FrameType.BODY]
+        frames = self.link_names
         if wanted is None:
             if "end_effector" in frames:
                 return "end_effector"
