@@ -44,6 +44,7 @@ clean:
 
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --upgrade pip  # old resolvers try every version of everything
 
 .venv/installed: pyproject.toml .venv/bin/python
 	@echo "installing into .venv, a minute or so"

@@ -11,6 +11,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 import pinocchio as pin
@@ -150,6 +151,11 @@ def main(name: str) -> None:
         "law(q, target)": lambda: law(q, target),
         "plain NumPy with pinv": plain,
     }
+    for nodes in (1, 2, 3):
+        planned = ssm.SelectiveLaw(
+            case.robot, law.protection, law.gain, law.rate_limits, sample_time=0.1, hold_nodes=nodes
+        )
+        candidates[f"law(q, target), hold of 0.1 s, {nodes} nodes"] = partial(planned, q, target)
     command = law(q, target)
     difference = np.abs(np.asarray(plain()["joint_rates"]) - command.joint_rates).max()
     print(f"{name}, {case.robot.name}, k = {law.protection.k}: plain NumPy differs by {difference:.1e} rad/s")

@@ -19,9 +19,12 @@ from pathlib import Path
 import numpy as np
 
 import ssm_decouple as ssm
+from ssm_decouple.studies.comparison import summarise
+from ssm_decouple.studies.sampling import sampling
 from ssm_decouple.viewing.figures import comparison, configuration
+from ssm_decouple.viewing.figures import sampling as draw_sampling
 from ssm_decouple.viewing.style import save
-from ssm_decouple.viewing.table import explain, markdown_table
+from ssm_decouple.viewing.table import drift_table, explain, markdown, markdown_table
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = (ROOT / "README.md", ROOT / "docs" / "models.md", ROOT / "docs" / "limits.md")
@@ -65,12 +68,38 @@ def patience() -> str:
     return "\n".join(lines)
 
 
+def drift() -> str:
+    """Return how far the protected axis turns when commands are held, for each plan and sample time."""
+    return markdown(drift_table([row for i in (1, 2, 3) for row in sampling(ssm.load_case(f"case{i}"))]))
+
+
+def gentle() -> str:
+    """Return the largest joint acceleration with and without limits, in cases 1 to 3 with held commands."""
+    lines = [["case", "limit (deg/s2)", "largest acceleration (deg/s2)", "arrived (s)", "left (mm)", "drift (deg)"]]
+    for i in (1, 2, 3):
+        for limit in (None, 1.0):
+            case = ssm.load_case(f"case{i}")
+            more = {"hold_nodes": 2} | ({} if limit is None else {"acceleration_limit": np.deg2rad(limit)})
+            row = summarise(replace(case, law={**case.law, **more}, simulation={"method": "held"}).run(), "selective")
+            numbers = (
+                f"{row.acceleration_max_deg_s2:.3f}",
+                f"{row.outcome_time_s:.0f}",
+                f"{1e3 * row.final_error_m:.2f}",
+            )
+            lines.append(
+                [case.name, "none" if limit is None else f"{limit:g}", *numbers, f"{row.protected_angle_deg:.1e}"]
+            )
+    return markdown(lines)
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
     "cases": lambda: cases_table(""),
     "flight": lambda: cases_table("_flight"),
     "stalls": stalls,
     "directions": directions,
     "patience": patience,
+    "drift": drift,
+    "gentle": gentle,
 }
 
 
@@ -96,6 +125,8 @@ def draw() -> None:
     with tempfile.TemporaryDirectory() as scratch:
         save(comparison(ssm.compare(ssm.load_case("case1")).motions), scratch, "case1_comparison")
         save(configuration(ssm.load_case("case2").run()), scratch, "case2_configuration")
+        drifts = [row for i in (1, 2, 3) for row in sampling(ssm.load_case(f"case{i}"))]
+        save(draw_sampling(drifts), scratch, "sampling")
         for path in Path(scratch).glob("*.png"):
             shutil.copy(path, folder / path.name)
 

@@ -21,6 +21,7 @@ from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError
 
 if TYPE_CHECKING:
     import xarray as xr
+    from rich.table import Table
 
     from ssm_decouple.studies.case import Case
     from ssm_decouple.studies.comparison import Summary
@@ -39,6 +40,9 @@ app = typer.Typer(
     epilog="Exit status: 0 all well; 1 bad input, one line says what and how to mend it; 2 wrong usage; "
     f"{NOT_ARRIVED} a motion of 'run' did not reach its target; {INTERRUPTED} interrupted, what was done is kept.",
 )
+
+study = typer.Typer(no_args_is_help=True, help="Studies that cross a case with something else.")
+app.add_typer(study, name="study")
 
 _CASES = "Names of cases ('ssm-decouple cases' lists them), TOML files, or 'all'."
 _PROTECT = (
@@ -142,6 +146,54 @@ def compare(
     if work.rows:
         work.files.append(write_csv(work.rows, work.folder / "comparison.csv"))
     work.report()
+
+
+@study.command("sampling")
+def study_sampling(
+    cases: Cases,
+    output: Output = Path("results"),
+    no_figures: NoFigures = False,
+    no_progress: NoProgress = False,
+    as_json: AsJson = False,
+) -> None:
+    """How far the protected axis really turns when commands are held between samples.
+
+    Each case under four ways of planning for the hold and five sample times. Writes OUTPUT/sampling.csv and a figure.
+
+    Example: ssm-decouple study sampling case1 case2 case3
+    """
+    from ssm_decouple.files import writable_folder
+    from ssm_decouple.studies.comparison import write_csv
+    from ssm_decouple.studies.sampling import PLANS, Drift, sampling
+    from ssm_decouple.viewing import figures, style
+    from ssm_decouple.viewing.table import drift_table, plain
+
+    folder, rows, interrupted = writable_folder(output), [], False
+    with _progress(no_progress or as_json) as show:
+
+        def tick(case: str, nodes: int, dt: float, share: float) -> None:
+            show(case, f"{PLANS[nodes]}, {dt:g} s", share)
+
+        try:
+            for case in _load(cases, None):
+                found: list[Drift] = []
+                found.extend(sampling(case, progress=partial(tick, case.name)))
+                rows += found
+        except KeyboardInterrupt:
+            interrupted = True
+    files = [write_csv(rows, folder / "sampling.csv")] if rows else []
+    if rows and not no_figures:
+        files += style.save(figures.sampling(rows), folder, "sampling")
+    if as_json:
+        shown = {"interrupted": interrupted, "rows": [dataclasses.asdict(row) for row in rows]}
+        typer.echo(json.dumps(shown | {"files": [str(path) for path in files]}, indent=2))
+    elif rows:
+        typer.echo("largest true rotation about a protected axis over the motion, deg")
+        _print_table(plain(drift_table(rows)))
+        typer.echo(f"{len(files)} files in {folder}")
+    if interrupted:
+        _complain("[bold yellow]interrupted:[/] the cases finished before are kept")
+        raise typer.Exit(INTERRUPTED)
 
 
 @app.command()
@@ -278,19 +330,23 @@ class _Work:
             found = {"interrupted": self.interrupted, "rows": rows, "files": [str(path) for path in self.files]}
             typer.echo(json.dumps(found, indent=2))
         elif self.rows:
-            console, table = Console(), terminal_table(self.rows)
-            # Where the terminal is narrower, a line that wraps is easier to read than a number that is cut.
-            console.width = max(console.width, Console(width=1000).measure(table).maximum)
-            console.print(table)
+            _print_table(terminal_table(self.rows))
             for row in self.rows:
                 if (reason := explain(row)) is not None:
-                    console.print(f"{_escape(reason)}", soft_wrap=True, highlight=False)
+                    typer.echo(reason)
             typer.echo(f"\n{len(self.files)} files in {self.folder}")
         if self.interrupted:
             _complain(
                 f"[bold yellow]interrupted:[/] {len(self.rows)} finished motions are kept in {_escape(self.folder)}"
             )
             raise typer.Exit(INTERRUPTED)
+
+
+def _print_table(table: Table) -> None:
+    console = Console()
+    # Where the terminal is narrower, a line that wraps is easier to read than a number that is cut.
+    console.width = max(console.width, Console(width=1000).measure(table).maximum)
+    console.print(table)
 
 
 def _file_name(law: str) -> str:

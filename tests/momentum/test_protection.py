@@ -128,3 +128,21 @@ def test_protected_directions_are_fixed_in_their_frame(ets_vii, rng):
     np.testing.assert_allclose(
         Protection("roll", "inertial").J_sub(coupling), -Protection("pitch").J_sub(coupling), atol=1e-16
     )
+
+
+@pytest.mark.parametrize("direction", [[0, 1, 0], [0, -3, 0], [0.3, -0.2, 0.9], [1e-9, 0, 1]])
+def test_a_boresight_may_only_turn_about_itself(direction):
+    protection = Protection.boresight(direction)
+    line = np.array(direction) / np.linalg.norm(direction)
+    assert protection.k == 2
+    np.testing.assert_allclose(protection.U_c.T @ line, 0, atol=1e-15)
+    # Where omega has no protected part it is along the line, and the line of sight stays: omega x line = 0.
+    omega = np.random.default_rng(1).normal(size=3)
+    free = omega - protection.U_c @ (protection.U_c.T @ omega)
+    np.testing.assert_allclose(np.cross(free, line), 0, atol=1e-15)
+
+
+@pytest.mark.parametrize("direction", [[0, 0, 0], [0, np.nan, 1], [0, 1], "y"])
+def test_what_is_no_boresight_is_refused(direction):
+    with pytest.raises(ssm.InputError, match="boresight"):
+        Protection.boresight(direction)

@@ -234,7 +234,7 @@ def test_a_target_out_of_reach_warns_by_how_much_and_runs(ets_vii):
         ({"dt": np.nan}, "dt is nan"),
         ({"duration": 0.0}, "duration is 0.0"),
         ({"dt": 20.0}, "dt is 20 s, longer than the duration of 10 s"),
-        ({"method": "euler"}, "method 'euler' is unknown: use explicit or rk4"),
+        ({"method": "euler"}, "method 'euler' is unknown: use explicit, held, rk4"),
         ({"target": [0, 0, np.inf]}, r"target is \[0.0, 0.0, inf\]; it needs 3 finite numbers"),
         ({"target": [0, 0]}, "it needs 3 finite numbers"),
         ({"arrival_tolerance": 0.0}, "arrival_tolerance is 0.0"),

@@ -42,14 +42,17 @@ def compiled_for(*signature: str) -> Callable[[F], F]:
 compiled = compiled_for()
 
 
+def inlined(function: F) -> F:
+    """Compile into the caller: for what is called in one or two places, where a call would cost as much as the work."""
+    njit: Any = numba.njit
+    return cast(F, njit(inline="always", error_model="numpy")(function))
+
+
 _MATRIX, _ROWS, _VECTOR = "float64[::1, :]", "float64[:, ::1]", "float64[::1]"
 # Pinocchio's matrices are stored by columns, everything else by rows.
-SELECTIVE_COMMAND = (
-    f"int64({_MATRIX}, {_MATRIX}, {_MATRIX}, {_VECTOR}, "  # from Pinocchio
-    f"{_ROWS}, boolean, {_ROWS}, {_VECTOR}, "  # constants
-    f"{_VECTOR}, {_VECTOR}, {_VECTOR})"
-)
-
+_FROM_PINOCCHIO = f"{_MATRIX}, {_MATRIX}, {_MATRIX}, {_VECTOR}"
+_CONSTANTS = f"{_ROWS}, {_ROWS}, {_VECTOR}"
+SELECTIVE_COMMAND = f"int64({_FROM_PINOCCHIO}, {_CONSTANTS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR})"
 
 # What selective_command returns.
 OK = 0
@@ -67,28 +70,41 @@ SMALLEST_SINGULAR_VALUE = 9  # of J_g N_sub
 RATE_SCALE = 10
 DAMPING = 11  # rho
 RANK = 12  # of J_sub
-RESULTS_SIZE = 13
+RATE_BLEND = 13  # 1, or less where acceleration limits held the rates back
+RESULTS_SIZE = 14
 
 # Where the scalars stand in `parameters`.
 GAIN = 0
 THRESHOLD = 1
 DAMPING_LIMIT = 2
 MASS = 3
-TOOL = 4  # 3: the end-effector in its joint's frame
-PARAMETERS_SIZE = 7
+LIMITS_STEPS = 4  # 1.0 if RATE_STEP limits anything
+INERTIAL = 5  # 1.0 if U_c is fixed in inertial axes, 0.0 in base axes
+TOOL = 6  # 3: the end-effector in its joint's frame
+PARAMETERS_SIZE = 9
 
 # The rows of `columns`: one entry a joint.
 MOVES_TOOL = 0  # 1.0 where the joint carries the end-effector, else 0.0
 RATE_LIMIT = 1
+RATE_STEP = 2  # largest change of the rate from one command to the next; infinite where it is not limited
+
+# The rows of `matrices`, one column a joint.
+J_BASE = 0  # 6: base twist per joint rate, base axes
+J_PROTECTED = 6  # 3: base angular velocity per joint rate, in the axes in which U_c is fixed
+J_TASK = 9  # 3: translational generalized Jacobian, inertial axes
+MATRICES_SIZE = 12
+WORK_SIZE = MATRICES_SIZE + 9 + 12  # rows of scratch that one command needs
 
 EPS = 2.220446049250313e-16
 # A row of J_sub below this many rounding errors of J_rc constrains nothing: it is noise.
 NOISE = 16.0 * EPS
 # Rates are scaled to just inside the limit, so that no later rounding lifts one above it.
 INSIDE = 1.0 - 8.0 * EPS
+# The same for the change of a rate, which is a difference and so rounds more.
+STEP_INSIDE = 1.0 - 1e-12
 
 
-@compiled
+@inlined
 def base_twist_map(A_g: Floats, J_base: Floats) -> float:
     """Fill J_base (6, n), the base twist in base axes per joint rate at zero momentum; return det(H_ww), 0 if singular.
 
@@ -127,7 +143,7 @@ def base_twist_map(A_g: Floats, J_base: Floats) -> float:
     return determinant
 
 
-@compiled
+@inlined
 def point_velocity_map(J: Floats, p: Floats, J_base: Floats, columns: Floats, base: Floats, J_g: Floats) -> None:
     """Fill J_g (3, n), the velocity of the point p per joint rate while momentum is conserved, inertial axes.
 
@@ -234,95 +250,63 @@ def scale_to_limits(q_dot: Floats, columns: Floats) -> float:
     return factor
 
 
-@compiled_for(SELECTIVE_COMMAND)
-def selective_command(
+@inlined
+def add_matrices_at(
     A_g: Floats,
     J: Floats,
     joint_rotation: Floats,
     joint_translation: Floats,
-    U_c: Floats,
-    inertial: bool,
     columns: Floats,
     parameters: Floats,
-    target: Floats,
-    target_velocity: Floats,
-    out: Floats,
+    weight: float,
+    matrices: Floats,
+    position: Floats,
+    scratch: Floats,
+    small: Floats,
 ) -> int:
-    """Write q_dot = (J_g N_sub)^+ v_cmd and what follows from it into `out`; return OK or what is wrong.
+    """Add one configuration's matrices and end-effector position, times a weight; return OK or what is wrong.
 
-    One Householder factorisation of [J_sub; J_g]^T carries the whole law. With Q its reflections in order, J_sub is
-    lower triangular in the first r = rank(J_sub) coordinates of Q^T q_dot, so a rate that is zero in those lies in
-    null(J_sub) whatever the others are. In the next three coordinates J_g is the lower triangular L (3, 3), whose
-    singular values are those of J_g N_sub, and min |L y - v_cmd|^2 + rho |y|^2 is the paper's objective.
-
-    Args:
-        A_g: Centroidal map (6, 6 + n), `pin.Data.Ag` after `pin.computeCentroidalMap`.
-        J: Joint Jacobians at the world origin (6, 6 + n), `pin.Data.J` after the same call.
-        joint_rotation: Rotation (3, 3) of the joint that holds the end-effector, joint to inertial.
-        joint_translation: Its position (3,), m, inertial axes.
-        U_c: Protected directions (3, k), orthonormal columns.
-        inertial: Whether U_c is in inertial axes instead of base axes.
-        columns: (2, n), MOVES_TOOL and RATE_LIMIT for each joint.
-        parameters: (PARAMETERS_SIZE,), by the indices above.
-        target: Desired end-effector position (3,), m, inertial axes.
-        target_velocity: Its velocity (3,), m/s.
-        out: (6 + n + RESULTS_SIZE,), overwritten.
-
-    Returns:
-        OK, NOT_FINITE (in the configuration or the target), NO_INERTIA (H_ww is singular), NOT_UNIT_QUATERNION or
-        WRONG_SIZE (of a target or of `out`).
+    `scratch` (9, n) and `small` (4, 6) are overwritten.
     """
     n = columns.shape[1]
-    k = U_c.shape[1]
-    if target.shape[0] != 3 or target_velocity.shape[0] != 3 or out.shape[0] != 6 + n + RESULTS_SIZE:
-        return WRONG_SIZE
-    results = out[6 + n :]
     mass = parameters[MASS]
     m_squared = A_g[0, 0] ** 2 + A_g[1, 0] ** 2 + A_g[2, 0] ** 2
     if abs(m_squared - mass * mass) > 1e-6 * mass * mass:
         return NOT_UNIT_QUATERNION
-
-    # Two allocations for all scratch: each would cost as much as a reflection.
-    scratch = np.empty((2 * k + 14, n))
-    J_base, J_g, J_sub = scratch[0:6], scratch[6:9], scratch[9 : 9 + k]
-    rows, q_dot, leak = scratch[9 + k : 12 + 2 * k], scratch[12 + 2 * k], scratch[13 + 2 * k]
-    small = np.empty((11, 6))
-    L, V, base = small[0:3], small[3:6], small[6:9]
-    weights, diagonal = small[9], small[10]
-
-    # The momentum law: base twist and end-effector velocity per joint rate.
-    determinant = base_twist_map(A_g, J_base)
-    if determinant == 0.0:
+    J_base, J_g, p = scratch[0:6], scratch[6:9], small[3]
+    if base_twist_map(A_g, J_base) == 0.0:
         return NO_INERTIA
-    p = results[POSITION : POSITION + 3]
     for r in range(3):
         p[r] = joint_translation[r]
         for c in range(3):
             p[r] += joint_rotation[r, c] * parameters[TOOL + c]
-    point_velocity_map(J, p, J_base, columns, base, J_g)
-
-    # Rows of J_sub and their scale, |J_rc|.
-    scale = 0.0
+        position[r] += weight * p[r]
+    point_velocity_map(J, p, J_base, columns, small[0:3], J_g)
     for j in range(n):
         x, y, z = J_base[3, j], J_base[4, j], J_base[5, j]
-        scale += x * x + y * y + z * z
-        if inertial:
+        if parameters[INERTIAL] > 0.0:
             x, y, z = (
                 (A_g[0, 0] * x + A_g[0, 1] * y + A_g[0, 2] * z) / mass,
                 (A_g[1, 0] * x + A_g[1, 1] * y + A_g[1, 2] * z) / mass,
                 (A_g[2, 0] * x + A_g[2, 1] * y + A_g[2, 2] * z) / mass,
             )
-        for i in range(k):
-            J_sub[i, j] = U_c[0, i] * x + U_c[1, i] * y + U_c[2, i] * z
-    noise = NOISE * np.sqrt(scale)
-
-    # Factor the protected rows first, largest first, then the task rows.
-    for j in range(n):
-        for i in range(k):
-            rows[i, j] = J_sub[i, j]
+        matrices[J_PROTECTED, j] += weight * x
+        matrices[J_PROTECTED + 1, j] += weight * y
+        matrices[J_PROTECTED + 2, j] += weight * z
+        for b in range(6):
+            matrices[J_BASE + b, j] += weight * J_base[b, j]
         for r in range(3):
-            rows[k + r, j] = J_g[r, j]
-    order = np.arange(k)
+            matrices[J_TASK + r, j] += weight * J_g[r, j]
+    return OK
+
+
+@inlined
+def factor_protected_rows(rows: Floats, weights: Floats, diagonal: Floats, order: Floats, k: int, noise: float) -> int:
+    """Make the first k rows lower triangular by reflections of all rows, largest row first; return their rank.
+
+    Rows that are below `noise` when their turn comes are left out: they constrain nothing.
+    """
+    n = rows.shape[1]
     rank = 0
     while rank < min(k, n):
         best, largest = rank, -1.0
@@ -339,11 +323,17 @@ def selective_command(
             for j in range(n):
                 rows[rank, j], rows[best, j] = rows[best, j], rows[rank, j]
         diagonal[rank] = reflect(rows, weights, rank, rank)
-        for i in range(rank + 1, k + 3):
+        for i in range(rank + 1, rows.shape[0]):
             apply_reflection(rows, weights, rank, rank, rows[i])
         rank += 1
+    return rank
+
+
+@inlined
+def factor_task_rows(rows: Floats, weights: Floats, k: int, rank: int, L: Floats) -> int:
+    """Make the task rows, after the first k, lower triangular L (3, 3) past `rank`; return how many columns L has."""
+    free = min(3, rows.shape[1] - rank)
     L[:, :] = 0.0
-    free = min(3, n - rank)
     for t in range(free):
         for s in range(t):
             L[t, s] = rows[k + t, rank + s]
@@ -353,8 +343,15 @@ def selective_command(
     for t in range(free, 3):
         for s in range(free):
             L[t, s] = rows[k + t, rank + s]
+    return free
 
-    # v_cmd, and the damped least-squares answer in the three free coordinates.
+
+@inlined
+def damped_solution(L: Floats, V: Floats, v: Floats, free: int, parameters: Floats, results: Floats, y: Floats) -> None:
+    """Add the minimiser of |L y - v|^2 + rho |y|^2 to y; L and V are overwritten.
+
+    rho is zero while the smallest singular value is above the threshold and rises smoothly below it.
+    """
     smallest = orthogonalise_columns(L, V)
     rho = 0.0
     if smallest < parameters[THRESHOLD]:
@@ -363,61 +360,268 @@ def selective_command(
     largest_square = 0.0
     for c in range(3):
         largest_square = max(largest_square, L[0, c] ** 2 + L[1, c] ** 2 + L[2, c] ** 2)
-    v = base[0]
-    for r in range(3):
-        results[ERROR + r] = target[r] - p[r]
-        v[r] = target_velocity[r] + parameters[GAIN] * results[ERROR + r]
-    q_dot[:] = 0.0
     for c in range(3):
         square = L[0, c] ** 2 + L[1, c] ** 2 + L[2, c] ** 2
         if rho == 0.0 and square <= EPS * EPS * 16.0 * largest_square:
             continue  # the Moore-Penrose inverse of a singular value that is zero
-        y = (L[0, c] * v[0] + L[1, c] * v[1] + L[2, c] * v[2]) / (square + rho)
+        part = (L[0, c] * v[0] + L[1, c] * v[1] + L[2, c] * v[2]) / (square + rho)
         for s in range(free):
-            q_dot[rank + s] += V[s, c] * y
+            y[s] += V[s, c] * part
+    results[SMALLEST_SINGULAR_VALUE] = smallest
+    results[DAMPING] = rho
+
+
+@compiled
+def take_out_leak(
+    J_sub: Floats, rows: Floats, weights: Floats, diagonal: Floats, order: Floats, rank: int, leak: Floats, x: Floats
+) -> None:
+    """Project x (n,) on null(J_sub) in place, x -= J_sub^+ J_sub x, by the reflections that factored J_sub."""
+    n = x.shape[0]
+    leak[:] = 0.0
+    for i in range(rank):
+        residual = 0.0
+        for j in range(n):
+            residual += J_sub[int(order[i]), j] * x[j]
+        for s in range(i):
+            residual -= rows[i, s] * leak[s]
+        leak[i] = residual / diagonal[i]
+    for i in range(rank - 1, -1, -1):
+        apply_reflection(rows, weights, i, i, leak)
+    for j in range(n):
+        x[j] -= leak[j]
+
+
+@compiled
+def largest_blend(start: Floats, end: Floats, previous: Floats, columns: Floats) -> float:
+    """Return the largest share in [0, 1] of the way from start to end that stays within RATE_STEP of previous.
+
+    Zero where `start` itself is further away than that.
+    """
+    share = 1.0
+    for j in range(start.shape[0]):
+        step, way = STEP_INSIDE * columns[RATE_STEP, j], end[j] - start[j]
+        if way > 0.0:
+            share = min(share, (previous[j] + step - start[j]) / way)
+        elif way < 0.0:
+            share = min(share, (previous[j] - step - start[j]) / way)
+    return max(share, 0.0)
+
+
+@inlined
+def solve(
+    matrices: Floats,
+    U_c: Floats,
+    columns: Floats,
+    parameters: Floats,
+    target: Floats,
+    target_velocity: Floats,
+    previous: Floats,
+    out: Floats,
+    scratch: Floats,
+    small: Floats,
+) -> int:
+    """Write the command that the matrices give into `out`; return OK or NOT_FINITE.
+
+    The end-effector's position stands in `out` already. `scratch` (12, n) and `small` (10, 6) are overwritten.
+
+    One Householder factorisation of [J_sub; J_g]^T carries the whole law. With Q its reflections in order, J_sub is
+    lower triangular in the first r = rank(J_sub) coordinates of Q^T q_dot, so a rate that is zero in those lies in
+    null(J_sub) whatever the others are. In the next three coordinates J_g is the lower triangular L (3, 3), whose
+    singular values are those of J_g N_sub, and min |L y - v_cmd|^2 + rho |y|^2 is the paper's objective.
+    """
+    n, k = columns.shape[1], U_c.shape[1]
+    results = out[6 + n :]
+    J_sub, rows, q_dot = scratch[0:k], scratch[k : 2 * k + 3], scratch[2 * k + 3]
+    leak, slow = scratch[2 * k + 4], scratch[2 * k + 5]
+    L, V, weights, diagonal, v, order = small[0:3], small[3:6], small[6], small[7], small[8], small[9]
+    for i in range(k):
+        order[i] = i
+
+    scale = 0.0
+    for j in range(n):
+        x, y, z = matrices[J_PROTECTED, j], matrices[J_PROTECTED + 1, j], matrices[J_PROTECTED + 2, j]
+        scale += x * x + y * y + z * z
+        for i in range(k):
+            J_sub[i, j] = U_c[0, i] * x + U_c[1, i] * y + U_c[2, i] * z
+            rows[i, j] = J_sub[i, j]
+        for r in range(3):
+            rows[k + r, j] = matrices[J_TASK + r, j]
+    rank = factor_protected_rows(rows, weights, diagonal, order, k, NOISE * np.sqrt(scale))
+    free = factor_task_rows(rows, weights, k, rank, L)
+
+    for r in range(3):
+        results[ERROR + r] = target[r] - results[POSITION + r]
+        v[r] = target_velocity[r] + parameters[GAIN] * results[ERROR + r]
+    q_dot[:] = 0.0
+    damped_solution(L, V, v, free, parameters, results, q_dot[rank:])
     for t in range(free - 1, -1, -1):
         apply_reflection(rows, weights, k + t, rank + t, q_dot)
     for i in range(rank - 1, -1, -1):
         apply_reflection(rows, weights, i, i, q_dot)
 
     rate_scale = scale_to_limits(q_dot, columns)
-
-    # What rounding has left in the protected rows goes, by the same reflections: q_dot -= J_sub^+ J_sub q_dot.
-    if rank > 0:
-        leak[:] = 0.0
-        for i in range(rank):
-            residual = 0.0
-            for j in range(n):
-                residual += J_sub[order[i], j] * q_dot[j]
-            for s in range(i):
-                residual -= rows[i, s] * leak[s]
-            leak[i] = residual / diagonal[i]
-        for i in range(rank - 1, -1, -1):
-            apply_reflection(rows, weights, i, i, leak)
+    blend = 1.0
+    if parameters[LIMITS_STEPS] > 0.0:
+        # Blend from the previous rates, brought into today's null space, to the wanted ones: the line between the two
+        # lies in that null space. From rest this is time scaling.
         for j in range(n):
-            q_dot[j] -= leak[j]
+            slow[j] = previous[j]
+        take_out_leak(J_sub, rows, weights, diagonal, order, rank, leak, slow)
+        blend = largest_blend(slow, q_dot, previous, columns)
+        for j in range(n):
+            q_dot[j] = slow[j] + blend * (q_dot[j] - slow[j])
+    if rank > 0:  # what rounding has left in the protected rows
+        take_out_leak(J_sub, rows, weights, diagonal, order, rank, leak, q_dot)
         # Where J_sub is ill-conditioned the correction can lift a rate above its limit by more than rounding.
         rate_scale *= scale_to_limits(q_dot, columns)
 
-    total = 0.0
+    total = v[0] + v[1] + v[2]
     for j in range(n):
         out[6 + j] = q_dot[j]
         total += q_dot[j]
     for b in range(6):
-        twist = 0.0
+        out[b] = 0.0
         for j in range(n):
-            twist += J_base[b, j] * q_dot[j]
-        out[b] = twist
+            out[b] += matrices[J_BASE + b, j] * q_dot[j]
     for i in range(3):
-        rate = 0.0
+        results[PROTECTED_RATE + i] = 0.0
         if i < k:
             for j in range(n):
-                rate += J_sub[i, j] * q_dot[j]
-        results[PROTECTED_RATE + i] = rate
-    results[SMALLEST_SINGULAR_VALUE] = smallest
+                results[PROTECTED_RATE + i] += J_sub[i, j] * q_dot[j]
     results[RATE_SCALE] = rate_scale
-    results[DAMPING] = rho
+    results[RATE_BLEND] = blend
     results[RANK] = rank
-    if not np.isfinite(total + v[0] + v[1] + v[2]):
-        return NOT_FINITE
-    return OK
+    return OK if np.isfinite(total) else NOT_FINITE
+
+
+@inlined
+def wrong_size(n: int, target: Floats, target_velocity: Floats, previous: Floats, out: Floats) -> bool:
+    """Say whether an array has the wrong length: compiled code would read past its end."""
+    vectors = target.shape[0] != 3 or target_velocity.shape[0] != 3
+    return vectors or previous.shape[0] != n or out.shape[0] != 6 + n + RESULTS_SIZE
+
+
+@compiled_for(SELECTIVE_COMMAND)
+def selective_command(
+    A_g: Floats,
+    J: Floats,
+    joint_rotation: Floats,
+    joint_translation: Floats,
+    U_c: Floats,
+    columns: Floats,
+    parameters: Floats,
+    target: Floats,
+    target_velocity: Floats,
+    previous: Floats,
+    out: Floats,
+) -> int:
+    """Write q_dot = (J_g N_sub)^+ v_cmd and what follows from it into `out`; return OK or what is wrong.
+
+    Args:
+        A_g: Centroidal map (6, 6 + n), `pin.Data.Ag` after `pin.computeCentroidalMap`.
+        J: Joint Jacobians at the world origin (6, 6 + n), `pin.Data.J` after the same call.
+        joint_rotation: Rotation (3, 3) of the joint that holds the end-effector, joint to inertial.
+        joint_translation: Its position (3,), m, inertial axes.
+        U_c: Protected directions (3, k), orthonormal columns, base or inertial axes as `parameters` says.
+        columns: (3, n), MOVES_TOOL, RATE_LIMIT and RATE_STEP for each joint.
+        parameters: (PARAMETERS_SIZE,), by the indices above.
+        target: Desired end-effector position (3,), m, inertial axes.
+        target_velocity: Its velocity (3,), m/s.
+        previous: The rates commanded before (n,); read only where RATE_STEP limits something.
+        out: (6 + n + RESULTS_SIZE,), overwritten.
+
+    Returns:
+        OK, NOT_FINITE (in the configuration or the target), NO_INERTIA (H_ww is singular), NOT_UNIT_QUATERNION or
+        WRONG_SIZE (of a target, of `previous` or of `out`).
+    """
+    n = columns.shape[1]
+    if wrong_size(n, target, target_velocity, previous, out):
+        return WRONG_SIZE
+    # Two allocations for all scratch: each costs as much as a reflection.
+    work, small = np.empty((WORK_SIZE, n)), np.empty((10, 6))
+    matrices, scratch = work[:MATRICES_SIZE], work[MATRICES_SIZE:]
+    position = out[6 + n + POSITION : 9 + n + POSITION]
+    matrices[:] = 0.0
+    position[:] = 0.0
+    status = add_matrices_at(
+        A_g,
+        J,
+        joint_rotation,
+        joint_translation,
+        columns,
+        parameters,
+        1.0,
+        matrices,
+        position,
+        scratch,
+        small,
+    )
+    if status != OK:
+        return status
+    return solve(matrices, U_c, columns, parameters, target, target_velocity, previous, out, scratch[9:], small)
+
+
+@compiled
+def add_matrices(
+    A_g: Floats,
+    J: Floats,
+    joint_rotation: Floats,
+    joint_translation: Floats,
+    U_c: Floats,
+    columns: Floats,
+    parameters: Floats,
+    weight: float,
+    matrices: Floats,
+    position: Floats,
+) -> int:
+    """Add one configuration's matrices (MATRICES_SIZE, n) and end-effector position (3,), times a weight.
+
+    The other arguments and the value returned are those of `selective_command`.
+    """
+    scratch, small = np.empty((9, columns.shape[1])), np.empty((4, 6))
+    return add_matrices_at(
+        A_g,
+        J,
+        joint_rotation,
+        joint_translation,
+        columns,
+        parameters,
+        weight,
+        matrices,
+        position,
+        scratch,
+        small,
+    )
+
+
+@compiled
+def settled(rates: Floats, before: Floats, tolerance: float) -> bool:
+    """Say whether rates (n,) differ from those before by less than a share of the largest, and remember them there."""
+    change, largest = 0.0, 0.0
+    for j in range(rates.shape[0]):
+        change = max(change, abs(rates[j] - before[j]))
+        largest = max(largest, abs(rates[j]))
+        before[j] = rates[j]
+    return change <= tolerance * largest
+
+
+@compiled
+def held_command(
+    matrices: Floats,
+    U_c: Floats,
+    columns: Floats,
+    parameters: Floats,
+    target: Floats,
+    target_velocity: Floats,
+    previous: Floats,
+    out: Floats,
+) -> int:
+    """Write the command of averaged matrices into `out`, the arguments being those of `selective_command`.
+
+    The averaged end-effector position stands in `out` already.
+    """
+    n = columns.shape[1]
+    if wrong_size(n, target, target_velocity, previous, out):
+        return WRONG_SIZE
+    scratch, small = np.empty((12, n)), np.empty((10, 6))
+    return solve(matrices, U_c, columns, parameters, target, target_velocity, previous, out, scratch, small)

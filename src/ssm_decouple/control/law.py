@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
@@ -14,6 +16,16 @@ from ssm_decouple.momentum.protection import Protection
 Floats = NDArray[np.float64]
 
 AT_REST: Floats = np.zeros(3)  # writable, as the kernel wants its vectors; never written
+
+# Nodes and weights on [0, 1]; with m nodes the mean is exact to order 2 m.
+GAUSS: dict[int, tuple[tuple[float, float], ...]] = {
+    0: (),
+    1: ((0.5, 1.0),),
+    2: ((0.5 - np.sqrt(3) / 6, 0.5), (0.5 + np.sqrt(3) / 6, 0.5)),
+    3: ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 4 / 9), (0.5 + np.sqrt(15) / 10, 5 / 18)),
+}
+PASSES = 20  # at most; each gains a factor of about sample time x joint rate
+CONVERGED = 1e-13  # relative change of the rates from pass to pass
 
 
 class Command:
@@ -51,7 +63,10 @@ class Command:
 
     @property
     def protected_rate(self) -> Floats:
-        """Constrained disturbance angular velocity w_sub = J_sub q_dot (k,), rad/s (paper, eq. 6): rounding."""
+        """Constrained disturbance angular velocity w_sub = J_sub q_dot (k,), rad/s (paper, eq. 6): rounding.
+
+        Of a law with hold nodes, its mean over the hold.
+        """
         return self._results(kernel.PROTECTED_RATE, self.k)
 
     @property
@@ -78,6 +93,11 @@ class Command:
     def damping(self) -> float:
         """The regularising scalar rho that was used (paper, eq. 11), m2; 0 away from singularities."""
         return float(self._results(kernel.DAMPING)[0])
+
+    @property
+    def rate_blend(self) -> float:
+        """Share in [0, 1] of the way from the previous rates to the wanted ones that acceleration limits allowed."""
+        return float(self._results(kernel.RATE_BLEND)[0])
 
     @property
     def regularised(self) -> bool:
@@ -112,6 +132,11 @@ class SelectiveLaw:
     s falls below `damping_threshold`, rho = `damping` (1 - (s / threshold)^2)^2 enters the paper's objective (eq. 11)
     smoothly; above it the answer is the exact minimum-norm one.
 
+    A command that is held until the next sample keeps the joints turning while J_sub moves on, so that a base which is
+    still at the sample turns a little in between. With `hold_nodes` the law is posed on matrices averaged over the
+    coming hold instead: at the middle (1), or at 2 or 3 Gauss points, along the motion that the command itself causes.
+    Then the *rotation* about a direction fixed in base axes is zero over the hold, to the quadrature's order.
+
     A law holds Pinocchio's scratch memory: use one law in one thread.
 
     Args:
@@ -121,9 +146,17 @@ class SelectiveLaw:
         rate_limit: Largest joint rates, rad/s or m/s: one number, an array (n,), or None for the URDF's.
         damping: rho at a singularity, m2; 0 gives the Moore-Penrose inverse everywhere.
         damping_threshold: Smallest singular value, m, below which rho enters.
+        sample_time: How long a command is held, s; needed for the two that follow.
+        hold_nodes: 0 poses the law at the sample (the paper's), 1 to 3 on matrices averaged over the hold.
+        acceleration_limit: Largest joint accelerations, rad/s2 or m/s2, from one command to the next: one number, an
+            array (n,), or None. The rates are blended from the previous ones within null(J_sub).
+
+    Attributes:
+        size: Length of the array that `evaluate` fills.
 
     Raises:
-        InputError: a number that is not positive (damping may be 0), a wrong shape, or a robot without joints.
+        InputError: a number that is not positive (damping may be 0), a wrong shape, a missing sample time, or a robot
+            without joints.
     """
 
     def __init__(
@@ -134,55 +167,95 @@ class SelectiveLaw:
         rate_limit: ArrayLike | None = None,
         damping: float = 1e-4,
         damping_threshold: float = 0.02,
+        sample_time: float | None = None,
+        hold_nodes: int = 0,
+        acceleration_limit: ArrayLike | None = None,
     ) -> None:
         n = robot.n_joints
         if n == 0:
             raise InputError(f"'{robot.name}' has no joints to command; put an arm on it with compose(..)")
-        for name, value in (("gain", gain), ("damping_threshold", damping_threshold)):
-            if not (np.isfinite(value) and value > 0):
+        period = np.inf if sample_time is None else sample_time
+        for name, value in (("gain", gain), ("damping_threshold", damping_threshold), ("sample_time", period)):
+            if not ((np.isfinite(value) or value is np.inf) and value > 0):
                 raise InputError(f"{name} is {value}; it must be a positive number")
         if not (np.isfinite(damping) and damping >= 0):
             raise InputError(f"damping is {damping}; it must be zero or a positive number")
+        if hold_nodes not in GAUSS:
+            raise InputError(f"hold_nodes is {hold_nodes}; it is 0 (at the sample), 1, 2 or 3")
+        if sample_time is None and (hold_nodes or acceleration_limit is not None):
+            raise InputError("hold_nodes and acceleration_limit need the sample_time, s, for which a command is held")
         self.robot = robot
         self.protection = protection
         self.gain = float(gain)
-        self.rate_limits: Floats = _rate_limits(robot, rate_limit)
         self.damping = float(damping)
         self.damping_threshold = float(damping_threshold)
+        self.sample_time = sample_time
+        self.hold_nodes = hold_nodes
+        self.rate_limits: Floats = _limits(robot, "rate_limit", robot.rate_limits if rate_limit is None else rate_limit)
+        self.acceleration_limits: Floats | None = None
+        if acceleration_limit is not None:
+            self.acceleration_limits = _limits(robot, "acceleration_limit", acceleration_limit)
+        self.size: int = 6 + n + kernel.RESULTS_SIZE
+        self._prepare()
 
-        frame = robot.model.frames[robot.end_effector_id]
+    def _prepare(self) -> None:
+        """Lay out what the kernel reads: views of Pinocchio's data and constant arrays."""
+        robot, n, model = self.robot, self.robot.n_joints, self.robot.model
+        frame, limited = model.frames[robot.end_effector_id], self.acceleration_limits is not None
         moves_tool = np.zeros(n)
-        moves_tool[[robot.model.joints[j].idx_v - 6 for j in robot.model.supports[frame.parentJoint] if j > 1]] = 1.0
-        scalars = [self.gain, self.damping_threshold, self.damping, robot.mass]
+        moves_tool[[model.joints[j].idx_v - 6 for j in model.supports[frame.parentJoint] if j > 1]] = 1.0
+        steps = np.full(n, np.inf)
+        if self.acceleration_limits is not None and self.sample_time is not None:
+            steps = self.acceleration_limits * self.sample_time
+        inertial = self.protection.frame == "inertial"
+        scalars = [self.gain, self.damping_threshold, self.damping, robot.mass, float(limited), float(inertial)]
         parameters = np.array([*scalars, *frame.placement.translation])
-        columns = np.vstack([moves_tool, self.rate_limits])
-        data = robot.model.createData()
+        columns = np.vstack([moves_tool, self.rate_limits, steps])
+        data = model.createData()
         # Live views into the Pinocchio data, fetched once: each fetch would cost as much as a tenth of the step.
         placement = data.oMi[frame.parentJoint]
         views = (data.Ag, data.J, placement.rotation, placement.translation)
-        constants = (protection.U_c.copy(), protection.frame == "inertial", columns, parameters)
-        self._prepared = (robot.model, data, (*views, *constants))
-        self.size: int = 6 + n + kernel.RESULTS_SIZE
+        constants = (self.protection.U_c.copy(), columns, parameters)
+        self._prepared = (model, data, views, constants, (*views, *constants))
+        self._no_rates: Floats = np.zeros(n)
+        self._J_base: Floats = np.zeros((6, n))
+        self._matrices: Floats = np.zeros((kernel.MATRICES_SIZE, n))
 
-    def __call__(self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike = AT_REST) -> Command:
+    def __call__(
+        self,
+        q: ArrayLike,
+        target: ArrayLike,
+        target_velocity: ArrayLike = AT_REST,
+        previous_rates: ArrayLike | None = None,
+    ) -> Command:
         """Return the command at a configuration.
 
         Args:
             q: Configuration (nq,).
             target: Desired end-effector position x_des (3,), m, inertial axes.
             target_velocity: Its velocity (3,), m/s, inertial axes.
+            previous_rates: The joint rates commanded before (n,), rad/s or m/s; needed with an acceleration limit,
+                zeros from rest.
 
         Returns:
             The command; its numbers are its own and stay as they are.
 
         Raises:
-            InputError: an argument has the wrong shape or is not finite, or q's quaternion is not of unit length.
+            InputError: an argument has the wrong shape or is not finite, q's quaternion is not of unit length, or
+                previous rates are missing.
         """
         values = np.empty(self.size)
-        self.evaluate(q, target, target_velocity, values)
+        self.evaluate(q, target, target_velocity, values, previous_rates)
         return Command(values, self.robot.n_joints, self.protection.k)
 
-    def evaluate(self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, out: Floats) -> None:
+    def evaluate(
+        self,
+        q: ArrayLike,
+        target: ArrayLike,
+        target_velocity: ArrayLike,
+        out: Floats,
+        previous_rates: ArrayLike | None = None,
+    ) -> None:
         """Compute a command into an array: the same as calling the law, without the result object.
 
         Args:
@@ -190,20 +263,65 @@ class SelectiveLaw:
             target: Desired end-effector position (3,), m, inertial axes.
             target_velocity: Its velocity (3,), m/s, inertial axes.
             out: Array (law.size,), overwritten: the velocity v (6 + n) and the results that `Command` names.
+            previous_rates: The joint rates commanded before (n,).
 
         Raises:
             InputError: as for the call.
         """
-        model, data, fixed = self._prepared
+        if previous_rates is None:
+            if self.acceleration_limits is not None:
+                raise InputError("an acceleration limit needs previous_rates: those commanded before, zeros from rest")
+            previous_rates = self._no_rates
+        model, data, _, _, fixed = self._prepared
         try:  # arrays of the right kind are not looked at twice
             pin.computeCentroidalMap(model, data, q)
-            status = kernel.selective_command(*fixed, target, target_velocity, out)  # type: ignore[arg-type]
+            status = kernel.selective_command(*fixed, target, target_velocity, previous_rates, out)  # type: ignore[arg-type]
         except (TypeError, ValueError):  # a list, another layout, a read-only array or a wrong length
-            pin.computeCentroidalMap(model, data, self.robot.checked(q))
-            vectors = _vector("target", target), _vector("target_velocity", target_velocity)
-            status = kernel.selective_command(*fixed, *vectors, self._checked_out(out))
+            q = self.robot.checked(q)
+            target, target_velocity = _vector("target", target), _vector("target_velocity", target_velocity)
+            previous_rates = self._checked_rates(previous_rates)
+            pin.computeCentroidalMap(model, data, q)
+            status = kernel.selective_command(*fixed, target, target_velocity, previous_rates, self._checked_out(out))
+        if status == kernel.OK and self.hold_nodes:
+            status = self._hold(q, np.asarray(target), np.asarray(target_velocity), np.asarray(previous_rates), out)
         if status != kernel.OK:
-            self._refuse(q, target, target_velocity, out, status)
+            self._refuse(q, target, target_velocity, previous_rates, out, status)
+
+    def base_twist(self, q: Floats, joint_rates: Floats) -> Floats:
+        """Return the base twist (6,), base axes, that joint rates (n,) cause at q; `Coupling.base_twist`, but quick."""
+        model, data, views, *_ = self._prepared
+        pin.computeCentroidalMap(model, data, q)
+        kernel.base_twist_map(views[0], self._J_base)
+        return self._J_base @ joint_rates
+
+    def _hold(self, q: ArrayLike, target: Floats, target_velocity: Floats, previous: Floats, out: Floats) -> int:
+        """Replace the command at the sample in `out` by the one for the hold, found by fixed-point iteration."""
+        model, data, views, constants, fixed = self._prepared
+        hold = float(self.sample_time or 0.0)
+        velocity, matrices = out[: model.nv], self._matrices
+        kernel.base_twist_map(views[0], self._J_base)  # at the sample, as is the base twist that the command tells
+        told = out[model.nv + kernel.POSITION : model.nv + kernel.ERROR + 3]
+        at_sample, position = told.copy(), told[:3]
+        middle = target + 0.5 * hold * target_velocity
+        status, before = kernel.OK, velocity[6:].copy()
+        for _ in range(PASSES):
+            matrices[:] = 0.0
+            position[:] = 0.0
+            for node, weight in GAUSS[self.hold_nodes]:
+                pin.computeCentroidalMap(model, data, pin.integrate(model, q, node * hold * velocity))
+                status = status or kernel.add_matrices(*fixed, weight, matrices, position)
+            status = status or kernel.held_command(matrices, *constants, middle, target_velocity, previous, out)
+            velocity[:6] = self._J_base @ velocity[6:]
+            if status != kernel.OK or kernel.settled(velocity[6:], before, CONVERGED):
+                break
+        told[:] = at_sample  # position and error, as the base twist
+        return status
+
+    def _checked_rates(self, rates: ArrayLike) -> Floats:
+        values = np.array(rates, dtype=float)
+        if values.shape != (self.robot.n_joints,) or not np.all(np.isfinite(values)):
+            raise InputError(f"previous_rates needs {self.robot.n_joints} finite joint rates, not shape {values.shape}")
+        return values
 
     def _checked_out(self, out: Floats) -> Floats:
         fit = isinstance(out, np.ndarray) and out.dtype == np.float64 and out.shape == (self.size,)
@@ -211,8 +329,11 @@ class SelectiveLaw:
             raise InputError(f"out must be a writable, contiguous float64 array ({self.size},), law.size long")
         return out
 
-    def _refuse(self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, out: Floats, status: int) -> None:
+    def _refuse(
+        self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, rates: ArrayLike, out: Floats, status: int
+    ) -> None:
         self.robot.checked(q)
+        self._checked_rates(rates)
         for name, value in (("target", target), ("target_velocity", target_velocity)):
             if not np.all(np.isfinite(_vector(name, value))):
                 raise InputError(f"{name} is not finite: {np.asarray(value).tolist()}")
@@ -223,8 +344,9 @@ class SelectiveLaw:
         }.get(status, "its numbers overflow")
         raise InputError(f"no command at this configuration of '{self.robot.name}': {why}")
 
-    def describe(self) -> dict[str, float | int | str | list[float] | list[list[float]]]:
+    def describe(self) -> dict[str, Any]:
         """Return the law's settings in plain types, for a record."""
+        limits = self.acceleration_limits
         return {
             "law": "selective",
             "U_c": self.protection.U_c.tolist(),
@@ -234,6 +356,9 @@ class SelectiveLaw:
             "rate_limits": self.rate_limits.tolist(),
             "damping": self.damping,
             "damping_threshold": self.damping_threshold,
+            "sample_time": self.sample_time,
+            "hold_nodes": self.hold_nodes,
+            "acceleration_limits": None if limits is None else limits.tolist(),
         }
 
 
@@ -244,15 +369,10 @@ def _vector(name: str, value: ArrayLike) -> Floats:
     return vector
 
 
-def _rate_limits(robot: Robot, given: ArrayLike | None) -> Floats:
-    if given is None:
-        return robot.rate_limits.copy()
+def _limits(robot: Robot, name: str, given: ArrayLike) -> Floats:
     limits = np.array(given, dtype=float)
     if limits.shape not in ((), (robot.n_joints,)):
-        raise InputError(
-            f"rate_limit has shape {limits.shape}; give one number or one for each of {robot.n_joints} joints"
-        )
-    limits = np.broadcast_to(limits, (robot.n_joints,)).copy()
+        raise InputError(f"{name} has shape {limits.shape}; give one number or one for each of {robot.n_joints} joints")
     if not np.all(limits > 0):
-        raise InputError(f"rate_limit is {given}; every joint's must be above zero (infinity for no limit)")
-    return limits
+        raise InputError(f"{name} is {given!r}; every joint's must be above zero (infinity for no limit)")
+    return np.broadcast_to(limits, (robot.n_joints,)).copy()

@@ -57,6 +57,27 @@ class Protection:
         self.correction: float = float(np.max(np.arctan2(cross, np.sum(given * self.U_c, axis=0)), initial=0.0))
 
     @classmethod
+    def boresight(cls, direction: ArrayLike, frame: Frame = "base") -> Protection:
+        """Protect a line of sight: the two directions across it, so that the base may only turn about it.
+
+        Args:
+            direction: Where the instrument looks (3,), any length.
+            frame: The axes in which it is fixed.
+
+        Raises:
+            InputError: the direction is zero or not finite.
+        """
+        try:
+            line = np.array(direction, dtype=float)
+        except (TypeError, ValueError):
+            line = np.empty(0)
+        length = float(np.linalg.norm(line)) if line.shape == (3,) else 0.0
+        if not (np.isfinite(length) and length > 0):
+            raise InputError(f"a boresight needs 3 finite numbers that are not all zero, not {direction!r}")
+        across = np.linalg.svd(line[None] / length)[2][1:]
+        return cls(across.T, frame)
+
+    @classmethod
     def parse(cls, text: str) -> Protection:
         """Read a protection from one word: a name, or numbers such as "0.5,0,0.866" or "1,0,0;0,0,1".
 

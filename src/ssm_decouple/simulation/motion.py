@@ -75,13 +75,20 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "base_rpy": (("time", "axis"), "rad", "base to inertial", "roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll)"),
     "base_linear_velocity": (("time", "axis"), "m/s", "base", "velocity of the base origin"),
     "base_angular_velocity": (("time", "axis"), "rad/s", "base", "angular velocity of the base"),
-    "protected_rate": (("time", "protected"), "rad/s", "U_c", "constrained disturbance angular velocity U_c^T omega"),
-    "protected_angle": (("time", "protected"), "rad", "U_c", "rotation about the protected axes, summed over samples"),
+    "base_rotation_integral": (("time", "axis"), "rad", "base", "integral of the base angular velocity from the start"),
+    "protected_rate": (
+        ("time", "protected"),
+        "rad/s",
+        "U_c",
+        "U_c^T omega as the law sees it: at the sample, or its mean over the hold",
+    ),
+    "protected_angle": (("time", "protected"), "rad", "U_c", "integral of the true rate about the protected axes"),
     "end_effector_position": (("time", "axis"), "m", "inertial", "end-effector"),
     "target_position": (("time", "axis"), "m", "inertial", "where the end-effector should be"),
     "end_effector_error": (("time",), "m", "", "distance from the end-effector to the target"),
     "smallest_singular_value": (("time",), "m", "", "smallest singular value of J_g N_sub"),
     "rate_scale": (("time",), "1", "", "factor that brought the joint rates inside their limits"),
+    "rate_blend": (("time",), "1", "", "share of the wanted change of rates that acceleration limits allowed"),
     "damping": (("time",), "m2", "", "regularising scalar rho, 0 away from singularities"),
     "linear_momentum": (("time", "axis"), "kg m/s", "inertial", "audit: linear momentum of (q, v)"),
     "angular_momentum": (("time", "axis"), "kg m2/s", "inertial", "audit: angular momentum about the centre of mass"),
@@ -96,8 +103,30 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
 }
 
 
+def rotation_about(U_c: Floats, frame: str, turns: Floats, quaternions: Floats) -> Floats:
+    """Return how far the base has turned about directions since the start (m, k), rad.
+
+    About directions fixed in base axes this is the integral of their components of the angular velocity. About
+    directions fixed in inertial axes the rotations from sample to sample are summed, which is that integral to second
+    order in the time between samples.
+
+    Args:
+        U_c: Directions, columns (3, k).
+        frame: "base" or "inertial".
+        turns: Integral of the base angular velocity, base axes (m, 3), rad.
+        quaternions: Base attitudes (m, 4), x y z w.
+    """
+    from scipy.spatial.transform import Rotation
+
+    if frame == "base" or len(turns) == 1:
+        return turns @ U_c
+    attitude = Rotation.from_quat(quaternions)
+    steps = (attitude[1:] * attitude[:-1].inv()).as_rotvec() @ U_c
+    return np.vstack([np.zeros((1, U_c.shape[1])), np.cumsum(steps, axis=0)])
+
+
 def build_motion(
-    law: SelectiveLaw, time: Floats, configurations: Floats, values: Floats, targets: Floats
+    law: SelectiveLaw, time: Floats, configurations: Floats, values: Floats, turns: Floats, targets: Floats
 ) -> xr.Dataset:
     """Assemble the record of a motion from its samples.
 
@@ -106,6 +135,7 @@ def build_motion(
         time: Sample times (m,), s.
         configurations: Configurations (m, nq).
         values: The law's output arrays (m, law.size).
+        turns: Integral of the base angular velocity, base axes (m, 3), rad.
         targets: Target positions (m, 3), m, inertial axes.
 
     Returns:
@@ -117,8 +147,6 @@ def build_motion(
     n, k, m = robot.n_joints, law.protection.k, time.size
     results = values[:, 6 + n :]
     attitude = Rotation.from_quat(configurations[:, 3:7])
-    steps = attitude[:-1].inv() * attitude[1:] if law.protection.frame == "base" else attitude[1:] * attitude[:-1].inv()
-    turned = steps.as_rotvec() @ law.protection.U_c if m > 1 else np.zeros((0, k))
     momenta, centres = np.empty((m, 6)), np.empty((m, 3))
     data = model.createData()
     total, centre = data.hg, data.com[0]
@@ -136,12 +164,16 @@ def build_motion(
         "base_linear_velocity": values[:, :3],
         "base_angular_velocity": values[:, 3:6],
         "protected_rate": results[:, kernel.PROTECTED_RATE : kernel.PROTECTED_RATE + k],
-        "protected_angle": np.vstack([np.zeros((1, k)), np.cumsum(turned, axis=0)]),
+        "base_rotation_integral": turns,
+        "protected_angle": rotation_about(
+            law.protection.U_c, law.protection.frame, turns, np.ascontiguousarray(configurations[:, 3:7])
+        ),
         "end_effector_position": results[:, kernel.POSITION : kernel.POSITION + 3],
         "target_position": targets,
         "end_effector_error": np.linalg.norm(results[:, kernel.ERROR : kernel.ERROR + 3], axis=1),
         "smallest_singular_value": results[:, kernel.SMALLEST_SINGULAR_VALUE],
         "rate_scale": results[:, kernel.RATE_SCALE],
+        "rate_blend": results[:, kernel.RATE_BLEND],
         "damping": results[:, kernel.DAMPING],
         "linear_momentum": momenta[:, :3],
         "angular_momentum": momenta[:, 3:],

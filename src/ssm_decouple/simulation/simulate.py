@@ -7,7 +7,6 @@ from collections.abc import Callable
 from typing import Literal
 
 import numpy as np
-import pinocchio as pin
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
@@ -15,14 +14,12 @@ from ssm_decouple.control import kernel
 from ssm_decouple.control.law import AT_REST, SelectiveLaw
 from ssm_decouple.errors import DecoupleWarning, InputError
 from ssm_decouple.simulation.motion import build_motion, judge
+from ssm_decouple.simulation.steps import STEPS, Reference
 
 Floats = NDArray[np.float64]
-Method = Literal["explicit", "rk4"]
+Method = Literal["explicit", "held", "rk4"]
 Target = Callable[[float], tuple[ArrayLike, ArrayLike]]
 Progress = Callable[[float], object]
-Reference = Callable[[float], tuple[Floats, Floats]]  # time to position and velocity
-
-METHODS = ("explicit", "rk4")
 
 
 class SimulationInterrupted(KeyboardInterrupt):
@@ -53,8 +50,10 @@ def simulate(
             and velocity.
         duration: Length of the motion, s.
         dt: Time between samples, s. A last shorter step is taken where `duration` is no multiple of it.
-        method: "explicit" holds each command for one step (the paper's); "rk4" is a fourth-order Lie-group Runge-Kutta
-            method that calls the law within the step too, and so integrates the law in continuous time.
+        method: "explicit" holds joint rates and base twist for one step (the paper's). "held" holds the joint rates, as
+            a perfect servo does, and moves the base exactly in between, by a sixth-order Magnus expansion: the truth
+            for a sampled law. "rk4" is a fourth-order Lie-group Runge-Kutta method that calls the law within the step
+            too, and so integrates the law in continuous time.
         arrival_tolerance: Distance, m, within which the end-effector has arrived.
         stop_early: End when the end-effector has arrived or has stalled instead of after `duration`.
         progress: Called now and then with the share done, 0 to 1.
@@ -62,18 +61,20 @@ def simulate(
     Returns:
         The motion. Coordinates `time` (s), `joint`, `axis`, `protected`; each variable has `units`, `frame` and
         `long_name`. Variables: configuration, joint_positions, joint_rates, base_position, base_quaternion, base_rpy,
-        base_linear_velocity, base_angular_velocity, protected_rate, protected_angle, end_effector_position,
-        target_position, end_effector_error, smallest_singular_value, rate_scale, damping, linear_momentum,
-        angular_momentum, centre_of_mass, U_c, robot_urdf. Attributes: `outcome` ("converged", "stalled" or "running"),
-        `outcome_time` (s), `final_error` (m), the law's settings, the method and the versions.
+        base_linear_velocity, base_angular_velocity, base_rotation_integral, protected_rate, protected_angle,
+        end_effector_position, target_position, end_effector_error, smallest_singular_value, rate_scale, rate_blend,
+        damping, linear_momentum, angular_momentum, centre_of_mass, U_c, robot_urdf. Attributes: `outcome`
+        ("converged", "stalled" or "running"), `outcome_time` (s), `final_error` (m), the law's settings, the method
+        and the versions.
 
     Raises:
         InputError: an argument makes no sense; the message names it.
         SimulationInterrupted: Ctrl-C; it is a KeyboardInterrupt and carries the motion so far.
     """
     time = _sample_times(duration, dt)
-    if method not in METHODS:
-        raise InputError(f"method '{method}' is unknown: use {' or '.join(METHODS)}")
+    if method not in STEPS:
+        raise InputError(f"method '{method}' is unknown: use {', '.join(STEPS)}")
+    _refuse_unfit_method(law, method, dt)
     if not (np.isfinite(arrival_tolerance) and arrival_tolerance > 0):
         raise InputError(f"arrival_tolerance is {arrival_tolerance}; it must be a positive distance, m")
     robot = law.robot
@@ -83,25 +84,38 @@ def simulate(
 
     samples = time.size
     configurations = np.empty((samples, robot.model.nq))
+    configurations[0] = start
+    turns = np.zeros((samples, 3))
     targets = np.empty((samples, 3))
     values = np.empty((samples, law.size))
-    step = _explicit_step if method == "explicit" else _runge_kutta_step
+    step = STEPS[method]
+    rates = values[:, 6 : 6 + robot.n_joints]
+    at_rest = np.zeros(robot.n_joints)
     error_column = slice(6 + robot.n_joints + kernel.ERROR, 6 + robot.n_joints + kernel.ERROR + 3)
     time_constant = 1.0 / law.gain
     tick = max(1, samples // 100)
     done = 0
 
     def record() -> xr.Dataset:
-        arrays = (values[:done], targets[:done])
-        return _finished(law, time[:done], configurations[:done], *arrays, method, arrival_tolerance)
+        motion = build_motion(law, time[:done], configurations[:done], values[:done], turns[:done], targets[:done])
+        outcome = judge(time[:done], motion.end_effector_error.values, arrival_tolerance, time_constant)
+        motion.attrs |= {
+            "method": method,
+            "arrival_tolerance": arrival_tolerance,
+            "outcome": outcome.name,
+            "outcome_time": outcome.time,
+            "final_error": outcome.error,
+        }
+        return motion
 
     try:
         for i in range(samples):
-            configurations[i] = (
-                start if i == 0 else step(law, reference, configurations[i - 1], values[i - 1], time[i - 1], time[i])
-            )
+            if i > 0:
+                before = (configurations[i - 1], values[i - 1], time[i - 1], time[i])
+                configurations[i], turned = step(law, reference, *before)
+                turns[i] = turns[i - 1] + turned
             targets[i], velocity = reference(time[i])
-            law.evaluate(configurations[i], targets[i], velocity, values[i])
+            law.evaluate(configurations[i], targets[i], velocity, values[i], rates[i - 1] if i else at_rest)
             done = i + 1
             if progress is not None and i % tick == 0:
                 progress(done / samples)
@@ -116,6 +130,17 @@ def simulate(
     if progress is not None:
         progress(1.0)
     return record()
+
+
+def _refuse_unfit_method(law: SelectiveLaw, method: str, dt: float) -> None:
+    if law.sample_time is not None and abs(law.sample_time - dt) > 1e-9 * dt:
+        raise InputError(f"the law's sample_time is {law.sample_time:g} s, dt is {dt:g} s; they must be the same")
+    if law.hold_nodes and method != "held":
+        raise InputError(
+            f"a law with hold_nodes plans for joint rates that are held: use method 'held', not '{method}'"
+        )
+    if law.acceleration_limits is not None and method == "rk4":
+        raise InputError("acceleration limits hold from sample to sample: use method 'held' or 'explicit', not 'rk4'")
 
 
 def _sample_times(duration: float, dt: float) -> Floats:
@@ -159,53 +184,3 @@ def _warn_out_of_reach(law: SelectiveLaw, q: Floats, target: Floats) -> None:
             DecoupleWarning,
             stacklevel=3,
         )
-
-
-def _explicit_step(
-    law: SelectiveLaw, reference: Reference, q: Floats, values: Floats, t: float, t_next: float
-) -> Floats:
-    model = law.robot.model
-    return pin.integrate(model, q, values[: model.nv] * (t_next - t))
-
-
-def _runge_kutta_step(
-    law: SelectiveLaw, reference: Reference, q: Floats, values: Floats, t: float, t_next: float
-) -> Floats:
-    """Classical fourth order in the coordinates u = difference(q, .) about the step's start (Munthe-Kaas).
-
-    There u_dot = d(difference)/dq v, which carries the curvature of SE(3) exactly.
-    """
-    model, h = law.robot.model, t_next - t
-    buffer = np.empty(law.size)
-
-    def slope(u: Floats, time: float) -> Floats:
-        stage = pin.integrate(model, q, u)
-        law.evaluate(stage, *reference(time), buffer)
-        return pin.dDifference(model, q, stage, pin.ARG1) @ buffer[: model.nv]
-
-    first = values[: model.nv]
-    second = slope(0.5 * h * first, t + 0.5 * h)
-    third = slope(0.5 * h * second, t + 0.5 * h)
-    fourth = slope(h * third, t + h)
-    return pin.integrate(model, q, (h / 6.0) * (first + 2.0 * second + 2.0 * third + fourth))
-
-
-def _finished(
-    law: SelectiveLaw,
-    time: Floats,
-    configurations: Floats,
-    values: Floats,
-    targets: Floats,
-    method: str,
-    tolerance: float,
-) -> xr.Dataset:
-    motion = build_motion(law, time, configurations, values, targets)
-    outcome = judge(time, motion.end_effector_error.values, tolerance, 1.0 / law.gain)
-    motion.attrs |= {
-        "method": method,
-        "arrival_tolerance": tolerance,
-        "outcome": outcome.name,
-        "outcome_time": outcome.time,
-        "final_error": outcome.error,
-    }
-    return motion

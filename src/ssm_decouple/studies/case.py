@@ -21,7 +21,8 @@ from ssm_decouple.errors import DecoupleError, InputError
 from ssm_decouple.model.catalogue import load_robot, models
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
-from ssm_decouple.simulation.simulate import METHODS, Progress, simulate
+from ssm_decouple.simulation.simulate import Progress, simulate
+from ssm_decouple.simulation.steps import STEPS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -57,6 +58,9 @@ _SCHEMA: dict[str, dict[str, tuple[str, bool]]] = {
         "rate_limit": (_NUMBER, False),
         "damping": (_NUMBER, False),
         "damping_threshold": (_NUMBER, False),
+        "hold_nodes": (_NUMBER, False),
+        "acceleration_limit_deg": (_NUMBER, False),
+        "acceleration_limit": (_NUMBER, False),
     },
     "simulation": {
         "duration": (_NUMBER, True),
@@ -82,7 +86,8 @@ class Case:
         base_rpy: Start roll, pitch, yaw of the base (3,), rad.
         target: Desired end-effector position (3,), m, inertial axes.
         protection: The case's own protection.
-        law: Further arguments of `SelectiveLaw`: gain, rate_limit, damping, damping_threshold.
+        law: Further arguments of `SelectiveLaw`: gain, rate_limit, damping, damping_threshold, hold_nodes,
+            acceleration_limit. The law's sample time is `dt`.
         duration: s.
         dt: Time between samples, s.
         simulation: Further arguments of `simulate`: method, arrival_tolerance.
@@ -98,7 +103,7 @@ class Case:
     base_rpy: tuple[float, ...]
     target: tuple[float, ...]
     protection: Protection
-    law: Mapping[str, float] = field(default_factory=dict)
+    law: Mapping[str, Any] = field(default_factory=dict)
     duration: float = 150.0
     dt: float = 0.1
     simulation: Mapping[str, Any] = field(default_factory=dict)
@@ -114,9 +119,13 @@ class Case:
         pose = pin.SE3(pin.rpy.rpyToMatrix(*self.base_rpy), np.array(self.base_position))
         return self.robot.configuration(self.joints, pose)
 
-    def make_law(self, protection: Protection | None = None) -> SelectiveLaw:
-        """Return the case's law, with another protection than its own if one is given."""
-        return SelectiveLaw(self.robot, protection or self.protection, **self.law)
+    def make_law(self, protection: Protection | None = None, dt: float | None = None) -> SelectiveLaw:
+        """Return the case's law, with another protection or time between samples than its own if one is given."""
+        step = self.dt if dt is None else dt
+        planned = "hold_nodes" in self.law or "acceleration_limit" in self.law
+        return SelectiveLaw(
+            self.robot, protection or self.protection, sample_time=step if planned else None, **self.law
+        )
 
     def run(
         self, protection: Protection | None = None, dt: float | None = None, progress: Progress | None = None
@@ -134,7 +143,7 @@ class Case:
         Raises:
             DecoupleError: the case cannot be run; the message says why.
         """
-        law = self.make_law(protection)
+        law = self.make_law(protection, dt)
         step = self.dt if dt is None else dt
         motion = simulate(law, self.start(), self.target, self.duration, step, progress=progress, **self.simulation)
         motion.attrs |= {
@@ -184,13 +193,12 @@ def _case(content: dict[str, Any], path: Path) -> Case:
     start, law, simulation = (content.get(table, {}) for table in ("start", "law", "simulation"))
     axes = content["protection"]["axes"]
     robot = content["robot"]
-    law_arguments = {
-        key: float(law[key]) for key in ("gain", "rate_limit", "damping", "damping_threshold") if key in law
-    }
-    if "rate_limit_deg" in law:
-        if "rate_limit" in law:
-            raise InputError("give rate_limit_deg or rate_limit, not both")
-        law_arguments["rate_limit"] = float(np.deg2rad(law["rate_limit_deg"]))
+    law_arguments = {key: value for key, value in law.items() if not key.endswith("_deg")}
+    for key in ("rate_limit", "acceleration_limit"):
+        if f"{key}_deg" in law:
+            if key in law:
+                raise InputError(f"give {key}_deg or {key}, not both")
+            law_arguments[key] = float(np.deg2rad(law[f"{key}_deg"]))
     return Case(
         name=path.stem,
         title=content.get("title", path.stem),
@@ -254,9 +262,9 @@ def _validate(content: dict[str, Any]) -> None:
         missing = [key for key, (_, needed) in keys.items() if needed and key not in values]
         if missing:
             raise InputError(f"{place}{missing[0]} is missing")
-    method = content["simulation"].get("method", METHODS[0])
-    if method not in METHODS:
-        raise InputError(f"[simulation] {_unknown('method', method, list(METHODS))}")
+    method = content["simulation"].get("method", "explicit")
+    if method not in STEPS:
+        raise InputError(f"[simulation] {_unknown('method', method, list(STEPS))}")
 
 
 def _unknown(kind: str, word: str, known: list[str]) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ import xarray as xr
 
 from ssm_decouple.files import written_whole
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.simulation.motion import rotation_about
 from ssm_decouple.studies.case import Case
 
 LAWS = ("none", "selective", "reactionless")
@@ -44,6 +45,7 @@ class Summary:
         damped_share: Share of the samples in which rho was above zero.
         rate_limited_share: Share of the samples in which the rates were scaled down to the limits.
         joint_travel_deg: Joint rates' norm integrated over time.
+        acceleration_max_deg_s2: Largest change of a joint rate from sample to sample, from rest on, over dt.
         centre_of_mass_drift_m: How far the centre of mass wandered: the integrator's error, zero in physics.
     """
 
@@ -66,6 +68,7 @@ class Summary:
     damped_share: float
     rate_limited_share: float
     joint_travel_deg: float
+    acceleration_max_deg_s2: float
     centre_of_mass_drift_m: float
 
 
@@ -81,6 +84,8 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
     swing = np.rad2deg(np.ptp(motion.base_rpy.values, axis=0))
     sigma = motion.smallest_singular_value.values
     speed = np.linalg.norm(motion.joint_rates.values, axis=1)
+    rates = motion.joint_rates.values
+    changes = np.diff(np.vstack([np.zeros_like(rates[:1]), rates[:-1]]), axis=0)
     drift = motion.centre_of_mass.values - motion.centre_of_mass.values[0]
     x, y, z = (float(value) for value in motion.end_effector_position.values[-1])
     return Summary(
@@ -103,6 +108,7 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         damped_share=float(np.mean(motion.damping.values > 0)),
         rate_limited_share=float(np.mean(motion.rate_scale.values < 1)),
         joint_travel_deg=float(np.rad2deg(np.sum(speed[:-1] * np.diff(time)))),
+        acceleration_max_deg_s2=float(np.rad2deg(np.abs(changes / np.diff(time)[:, None]).max())),
         centre_of_mass_drift_m=float(np.linalg.norm(drift, axis=1).max()),
     )
 
@@ -118,10 +124,9 @@ def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[An
     U_c, frame = np.array(json.loads(motion.attrs["case_U_c"])).reshape(3, -1), motion.attrs["case_frame"]
     if np.array_equal(U_c, motion.U_c.values) and frame == json.loads(motion.attrs["law"])["frame"]:
         return motion.protected_rate.values, motion.protected_angle.values
-    attitude, omega = Rotation.from_quat(motion.base_quaternion.values), motion.base_angular_velocity.values
-    steps = attitude[:-1].inv() * attitude[1:] if frame == "base" else attitude[1:] * attitude[:-1].inv()
-    rate = (omega if frame == "base" else attitude.apply(omega)) @ U_c
-    return rate, np.vstack([np.zeros((1, U_c.shape[1])), np.cumsum(steps.as_rotvec() @ U_c, axis=0)])
+    omega, quaternions = motion.base_angular_velocity.values, motion.base_quaternion.values
+    rate = (omega if frame == "base" else Rotation.from_quat(quaternions).apply(omega)) @ U_c
+    return rate, rotation_about(U_c, frame, motion.base_rotation_integral.values, quaternions)
 
 
 @dataclass(frozen=True)
@@ -194,17 +199,18 @@ def compare(case: Case, dt: float | None = None) -> Comparison:
     return Comparison(case, dict(compare_step_by_step(case, dt)))
 
 
-def write_csv(rows: list[Summary], path: str | Path) -> Path:
-    """Write summaries as a CSV table, whole or not at all.
+def write_csv(rows: Sequence[Any], path: str | Path) -> Path:
+    """Write results, dataclasses of one kind, as a CSV table, whole or not at all.
 
     Raises:
         FileError: the place cannot be written.
     """
     final = Path(path)
+    columns = [column.name for column in fields(rows[0])]
     with written_whole(final) as temporary, temporary.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow([column.name for column in fields(Summary)])
+        writer.writerow(columns)
         for row in rows:
-            values = (getattr(row, column.name) for column in fields(Summary))
+            values = (getattr(row, column) for column in columns)
             writer.writerow([" ".join(map(repr, value)) if isinstance(value, tuple) else value for value in values])
     return final

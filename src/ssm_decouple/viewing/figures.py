@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ssm_decouple.studies.comparison import disturbance
+from ssm_decouple.studies.sampling import PLANS, Drift
 from ssm_decouple.viewing.spacecraft import draw_configurations
 from ssm_decouple.viewing.style import AXIS_COLORS, LAW_LINES, PAGE, PROTECTED, joint_colors, panels, save, styled
 
@@ -134,6 +135,26 @@ def comparison(motions: Mapping[str, xr.Dataset]) -> Figure:
     figure.suptitle(first.attrs.get("title", first.attrs["robot"]), fontsize=9)
     figure.legend(*distance.get_legend_handles_labels(), ncols=len(motions), loc="outside lower center")
     distance.set_xlim(0, float(first.time[-1]))
+    return figure
+
+
+@styled
+def sampling(rows: Sequence[Drift]) -> Figure:
+    """Draw the drift of the protected axis against the sample time, a panel a case, a line for each plan."""
+    names = list(dict.fromkeys(row.case for row in rows))
+    figure, axes = panels(1, len(names), width=PAGE, height=2.3)
+    for axis, name in zip(axes, names, strict=True):
+        for nodes, color in zip(PLANS, ("#8C8C8C", "#56B4E9", "#0072B2", PROTECTED), strict=True):
+            mine = sorted(
+                (row.sample_time_s, row.drift_deg) for row in rows if (row.case, row.hold_nodes) == (name, nodes)
+            )
+            times, drifts = zip(*mine, strict=True)
+            axis.loglog(times, np.maximum(drifts, 1e-19), color=color, marker="o", markersize=2.5, label=PLANS[nodes])
+        axis.set(title=name, xlabel="sample time (s)", ylim=(1e-19, 1e-1))
+        axis.set_xticks(times, [f"{time:g}" for time in times])
+        axis.set_xticks([], minor=True)
+    axes[0].set_ylabel("rotation about the\nprotected axes (deg)")
+    figure.legend(*axes[0].get_legend_handles_labels(), ncols=len(PLANS), loc="outside lower center")
     return figure
 
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 from rich import box
 from rich.table import Table
 
 from ssm_decouple.studies.comparison import UNDAMPED, Summary
+from ssm_decouple.studies.sampling import PLANS, Drift
 
 HEADINGS = ("case", "law", "k", "outcome", "left (mm)", "|w_sub| (rad/s)", "roll, pitch, yaw (deg)", "sigma (m)")
 
@@ -54,6 +56,37 @@ def markdown_table(rows: Sequence[Summary]) -> str:
     ]
     lines += [f"| {' | '.join(cells(row))} |" for row in rows]
     return "\n".join(lines)
+
+
+def drift_table(rows: Sequence[Drift]) -> list[list[str]]:
+    """Return the drift of sampled laws as rows of texts, headings first: one row a case and plan, one column a time."""
+    times = sorted({row.sample_time_s for row in rows})
+    lines = [["case", "law planned", *(f"{time:g} s" for time in times), "order"]]
+    found = {(row.case, row.hold_nodes, row.sample_time_s): row for row in rows}
+    for case, nodes in dict.fromkeys((row.case, row.hold_nodes) for row in rows):
+        cells_ = [f"{found[case, nodes, time].drift_deg:.1e}" for time in times]
+        orders = [found[case, nodes, time].order for time in times]
+        known = [order for order in orders if order is not None]
+        lines.append([case, PLANS[nodes], *cells_, f"{np.median(known):.1f}" if known else "rounding"])
+    return lines
+
+
+def markdown(lines: Sequence[Sequence[str]]) -> str:
+    """Return rows of texts, headings first, as a Markdown table; the first two columns are words, the rest numbers."""
+    head, *body = lines
+    rule = ["---"] * 2 + ["---:"] * (len(head) - 2)
+    return "\n".join(f"| {' | '.join(line)} |" for line in (head, rule, *body))
+
+
+def plain(lines: Sequence[Sequence[str]]) -> Table:
+    """Return rows of texts, headings first, as a table for a terminal."""
+    head, *body = lines
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for i, heading in enumerate(head):
+        table.add_column(heading, justify="left" if i < 2 else "right", no_wrap=True)
+    for line in body:
+        table.add_row(*line)
+    return table
 
 
 def explain(row: Summary) -> str | None:
