@@ -20,7 +20,7 @@ coupling = robot.coupling(q)
 J_sub, N_sub = protection.J_sub(coupling), protection.N_sub(coupling)
 print("J_sub, rad/s of base per rad/s of joint:", J_sub.round(4))
 print("singular values of J_g:      ", np.linalg.svd(coupling.J_gt, compute_uv=False).round(3))
-print("singular values of J_g N_sub:", np.linalg.svd(coupling.J_gt @ N_sub, compute_uv=False).round(3))
+print("singular values of J_gt N_sub:", np.linalg.svd(coupling.J_gt @ N_sub, compute_uv=False).round(3))
 law = ssm.SelectiveLaw(robot, protection, gain=0.05, rate_limit=np.deg2rad(5.0))
 print(law(q, target))
 

@@ -10,7 +10,7 @@ EXAMPLES = Path(__file__).parents[1] / "examples"
 PRINTS = {
     "case1": "converged at 102.0 s, 0.90 mm left",
     "case2": "converged at 137.2 s, 5.25 mm left",
-    "case3": "case3 | selective | 2 | arrived, 97 s | 0.70",
+    "case3": "case3 | selective | 2 | converged, 97 s | 0.70",
     "own_axis": "of 40 directions can be protected",
     "own_robot": "yaw       converged",
 }

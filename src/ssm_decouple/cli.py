@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 import sys
 import warnings
 from collections.abc import Iterator
@@ -41,7 +42,7 @@ app = typer.Typer(
     f"{NOT_ARRIVED} a motion of 'run' did not reach its target; {INTERRUPTED} interrupted, what was done is kept.",
 )
 
-study = typer.Typer(no_args_is_help=True, help="Studies that cross a case with something else.")
+study = typer.Typer(no_args_is_help=True, help="Parameter studies of cases.")
 app.add_typer(study, name="study")
 
 _CASES = "Names of cases ('ssm-decouple cases' lists them), TOML files, or 'all'."
@@ -98,12 +99,16 @@ def run(
     from ssm_decouple.momentum.protection import Protection
     from ssm_decouple.studies.comparison import summarise
 
-    protection = None if protect is None else Protection.parse(protect)
-    law = "selective" if protect is None else {"none": "none", "all": "reactionless"}.get(protect, "custom")
+    law = "selective"
+    if protect is not None:
+        law = {"none": "none", "all": "reactionless"}.get(protect, f"protect {protect}")
+        chosen = Protection.parse(protect)
     work = _Work(output, no_figures, as_json)
     with work.collecting(), _progress(no_progress or as_json) as show:
         for case in _load(cases, damping):
-            motion = case.run(protection, dt, partial(show, case.name, law))
+            if protect is not None:  # it becomes the case's own, so that w_sub is about these axes
+                case = dataclasses.replace(case, protection=chosen)
+            motion = case.run(dt=dt, progress=partial(show, case.name, law))
             work.keep_motion(case, law, motion)
             work.draw(case, law, motion)
             work.rows.append(summarise(motion, law))
@@ -350,7 +355,7 @@ def _print_table(table: Table) -> None:
 
 
 def _file_name(law: str) -> str:
-    return law.replace(", ", "_")
+    return re.sub(r"[^\w.+@-]+", "_", law)
 
 
 @contextmanager

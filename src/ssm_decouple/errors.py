@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
 
 class DecoupleError(Exception):
     """Base of every error that this package raises on purpose."""
@@ -21,3 +24,15 @@ class FileError(DecoupleError, OSError):
 
 class DecoupleWarning(UserWarning):
     """Something that runs, but probably not as meant."""
+
+
+def as_floats(name: str, value: ArrayLike) -> NDArray[np.float64]:
+    """Return numbers as an array of floats.
+
+    Raises:
+        InputError: they are no real numbers; the message calls them `name`.
+    """
+    try:
+        return np.array(value, dtype=float)
+    except (TypeError, ValueError, OverflowError):
+        raise InputError(f"{name} is {value!r}; it needs real numbers") from None

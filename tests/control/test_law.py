@@ -33,7 +33,7 @@ def random_protection(rng: np.random.Generator, k: int, frame: str = "base") -> 
 @pytest.mark.parametrize("frame", ["base", "inertial"])
 @pytest.mark.parametrize("k", [0, 1, 2, 3])
 def test_the_paper_s_formula(robot, rng, k, frame):
-    """q_dot = (J_g N_sub)^+ v_cmd, eq. 17, with Moore-Penrose inverses by singular value decomposition."""
+    """q_dot = (J_gt N_sub)^+ v_cmd, eq. 17, with Moore-Penrose inverses by singular value decomposition."""
     for _ in range(5):
         protection = random_protection(rng, k, frame)
         law = unlimited(robot, protection, gain=0.3, damping=0.0)
@@ -164,7 +164,7 @@ def test_the_protected_rate_is_rounding_in_exact_arithmetic(robots, rng, k, damp
 @pytest.mark.parametrize("bend", [1e-3, 1e-6, 1e-9, 1e-12, 0.0])
 @pytest.mark.parametrize("damping", [0.0, 1e-4])
 def test_the_protected_rate_is_rounding_next_to_a_singularity(ets_vii, bend, damping):
-    """The straight arm: J_g N_sub is singular there, which is where a pseudo-inverse of it loses the protection."""
+    """The straight arm: J_gt N_sub is singular there, which is where a pseudo-inverse of it loses the protection."""
     for axes in ("yaw", "roll+yaw", "all"):
         protection = Protection(axes)
         law = SelectiveLaw(ets_vii, protection, damping=damping)
@@ -395,7 +395,10 @@ def test_a_command_keeps_its_numbers(ets_vii):
     ("options", "says"),
     [
         ({"gain": 0.0}, "gain is 0.0; it must be a positive"),
-        ({"gain": np.nan}, "gain is nan"),
+        ({"gain": np.nan}, "gain is nan; it must be one finite number"),
+        ({"gain": np.inf}, "gain is inf"),
+        ({"gain": "a"}, "gain is 'a'; it needs real numbers"),
+        ({"rate_limit": "x"}, "rate_limit is 'x'; it needs real numbers"),
         ({"rate_limit": 0.0}, "rate_limit is 0.0; every joint's must be above zero"),
         ({"rate_limit": [1, 1, 1, 1, 1, -1]}, "must be above zero"),
         ({"rate_limit": [1, 1]}, r"rate_limit has shape \(2,\); give one number or one for each of 6"),
@@ -430,12 +433,45 @@ def test_bad_arguments_are_refused(ets_vii):
     stretched[3:7] = [0.9, 0, 0, 1.2]
     with pytest.raises(ssm.InputError, match=r"quaternion q\[3:7\] has length 1.5"):
         law(stretched, [0, 0, 1])
-    with pytest.raises(ssm.InputError, match=r"out must be a writable, contiguous float64 array \(26,\)"):
-        law.evaluate(q, np.zeros(3), np.zeros(3), np.zeros((26, 2))[:, 0])
+    with pytest.raises(ssm.InputError, match=r"out must be a writable, contiguous float64 array \(27,\)"):
+        law.evaluate(q, np.zeros(3), np.zeros(3), np.zeros((27, 2))[:, 0])
     with pytest.raises(ssm.InputError, match="out must be"):
-        law.evaluate(q, np.zeros(3), np.zeros(3), np.zeros(26, dtype=np.float32))
+        law.evaluate(q, np.zeros(3), np.zeros(3), np.zeros(27, dtype=np.float32))
     with pytest.raises(ssm.InputError, match="out must be"):
-        law.evaluate(q, np.zeros(3), np.zeros(3), np.zeros(25))
+        law.evaluate(q, np.zeros(3), np.zeros(3), np.zeros(26))
+
+
+def test_a_continuous_joint_needs_a_cosine_and_a_sine(write):
+    robot = planar_robot(write)
+    q = robot.configuration([0.3, 0.8, -0.6])
+    q[7:9] = [2.0, 0.0]
+    for use in (robot.coupling, lambda q: SelectiveLaw(robot, Protection("yaw"))(q, [1, 0, 0])):
+        with pytest.raises(
+            ssm.InputError, match=r"continuous joint 'j1' takes cosine and sine, q\[7:9\] is \[2.0, 0.0\]"
+        ):
+            use(q)
+
+
+@pytest.mark.parametrize("distance", [0.0, 1e2, 1e4])
+def test_what_cannot_turn_costs_nothing_far_from_the_origin_either(write, rng, distance):
+    robot = planar_robot(write)
+    for _ in range(20):
+        attitude = pin.Quaternion(*(rng.normal(size=4))).normalized().matrix()
+        pose = pin.SE3(attitude, distance * rng.uniform(-1, 1, 3))
+        q = robot.configuration(rng.uniform(-1, 1, 3), pose)
+        assert unlimited(robot, Protection("roll"))(q, pose.translation).rank == 0
+        assert unlimited(robot, Protection("all"))(q, pose.translation).rank == 1
+        coupling = robot.coupling(q)
+        assert Protection("roll").null_space_basis(coupling).shape == (3, 3)
+        assert Protection("all").null_space_basis(coupling).shape == (3, 2)
+
+
+def test_the_rate_limit_comes_before_the_acceleration_limit(ets_vii):
+    for axes in ("none", "yaw"):
+        law = SelectiveLaw(ets_vii, Protection(axes), rate_limit=0.08, sample_time=0.1, acceleration_limit=0.1)
+        command = law(ets_vii.configuration(), [1, 0, 2], previous_rates=[0.5] * 6)
+        assert np.abs(command.joint_rates).max() <= 0.08
+        assert command.rate_blend == 0
 
 
 def test_a_robot_without_joints_has_no_law():

@@ -114,6 +114,20 @@ def test_with_three_nodes_the_axis_does_not_drift(ets_vii):
     assert np.ptp(motion.centre_of_mass.values, axis=0).max() < 1e-12
 
 
+@pytest.mark.parametrize("name", ["case2_flight", "case3_flight"])
+def test_the_plan_holds_at_singularities_too(name):
+    """There the iteration on the whole law does not settle, and the last rates are projected instead."""
+    case = ssm.load_case(name)
+    law = SelectiveLaw(case.robot, case.protection, rate_limit=np.deg2rad(5), sample_time=0.5, hold_nodes=3)
+    motion = ssm.simulate(law, case.start(), case.target, 150.0, 0.5, method="held")
+    assert motion.attrs["outcome"] == "stalled"
+    assert motion.damping.values.max() > 0
+    assert motion.plan_change.values.max() < 1e-12
+    assert np.rad2deg(np.abs(motion.protected_angle.values).max()) < 1e-12
+    assert np.abs(motion.joint_rates.values).max() <= np.deg2rad(5)
+    assert np.abs(motion.protected_rate.values).max() < 1e-18
+
+
 def test_a_moving_target_is_led_by_half_a_hold(ets_vii):
     q = ets_vii.configuration(START)
     centre, speed = ets_vii.frame_pose(q).translation, np.array([0.01, 0.0, 0.0])
@@ -211,6 +225,8 @@ def test_bad_use_is_refused(ets_vii):
     planned = SelectiveLaw(ets_vii, Protection("yaw"), sample_time=0.1, hold_nodes=1)
     with pytest.raises(ssm.InputError, match=r"sample_time is 0.1 s, dt is 0.2 s"):
         ssm.simulate(planned, q, TARGET, 1.0, 0.2, method="held")
+    with pytest.raises(ssm.InputError, match=r"duration 1.05 s is no whole number of steps of 0.1 s"):
+        ssm.simulate(planned, q, TARGET, 1.05, 0.1, method="held")
     with pytest.raises(ssm.InputError, match="use method 'held', not 'explicit'"):
         ssm.simulate(planned, q, TARGET, 1.0, 0.1)
     with pytest.raises(ssm.InputError, match="not 'rk4'"):

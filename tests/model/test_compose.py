@@ -61,6 +61,12 @@ def test_an_arm_can_be_mounted_on_any_link():
     )
 
 
+@pytest.mark.parametrize("mount", [np.diag([-1.0, 1, 1, 1]), np.zeros((4, 4)), 2 * np.eye(4), "abc", [[1], [2, 3]]])
+def test_what_is_no_mount_is_refused(mount):
+    with pytest.raises(ssm.InputError, match="mount is"):
+        ssm.compose("ets_vii_bus", ssm.example_robot(UR5), mount, end_effector="tool0", prefix="a_")
+
+
 def test_what_cannot_be_composed_is_refused():
     with pytest.raises(
         ssm.ModelError, match=r"share the link names bus, link_1, link_2, \.\.; give compose another prefix"
@@ -72,7 +78,7 @@ def test_what_cannot_be_composed_is_refused():
         ssm.compose("ets_vii_bus", ssm.example_robot(UR5), [0, 0, 0])
     with pytest.raises(ssm.ModelError, match="no link 'hand' for its end-effector; it has base_link, shoulder_link"):
         ssm.compose("ets_vii_bus", ssm.example_robot(UR5), [0, 0, 0], end_effector="hand")
-    with pytest.raises(ssm.InputError, match=r"mount is a pinocchio.SE3"):
+    with pytest.raises(ssm.InputError, match=r"mount is not finite"):
         ssm.compose("ets_vii_bus", ssm.example_robot(UR5), [0, 0, np.nan], end_effector="tool0")
     with pytest.raises(
         ssm.ModelError, match=r"example-robot-data has no 'ur_description/urdf/ur6.urdf'; it has ur_desc"

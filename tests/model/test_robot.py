@@ -27,6 +27,17 @@ def arm(kind: str = "revolute", limit: str = LIMIT, body: str = BODY, extra: str
     return f'<robot name="r">{BUS}<link name="arm">{body}</link>{joint}{extra}</robot>'
 
 
+def joint(name: str, parent: str, child: str) -> str:
+    return f'<joint name="{name}" type="fixed"><parent link="{parent}"/><child link="{child}"/></joint>'
+
+
+def test_a_joint_and_a_link_may_share_a_name(write):
+    text = arm(extra="<link name='tip'/>" + joint("tip", "arm", "tip"))
+    robot = ssm.load_robot(write(text))
+    assert robot.end_effector == "tip"
+    np.testing.assert_array_equal(robot.frame_pose(robot.configuration(), "tip").translation, 0)
+
+
 def test_configuration_from_an_array_and_by_name_agree(robot, rng):
     values = rng.uniform(-1, 1, robot.n_joints)
     by_name = dict(zip(robot.joint_names, values, strict=True))
@@ -109,6 +120,15 @@ def test_momentum_of_a_motion_is_the_sum_over_bodies(robot, rng):
         ('<robot name="r"/>', "has no <link>"),
         ('<robot name="r"><link name="a"/><link name="b"/></robot>', "exactly one root link"),
         ('<robot name="r"><link name="a"/></robot>', "no link has mass"),
+        (
+            arm(extra="<link name='x'/><link name='y'/>" + joint("p", "x", "y") + joint("q", "y", "x")),
+            "links x, y form a loop",
+        ),
+        (arm().replace('<axis xyz="0 0 1"/>', '<axis xyz="0 0 0"/>'), 'joint elbow: <axis xyz="0 0 0"> needs 3 finite'),
+        (arm().replace('origin xyz="0.5 0 0"', 'origin xyz="0.5 0"'), 'link arm: <origin xyz="0.5 0"> needs 3 finite'),
+        (arm().replace('mass value="2"', 'mass value="2_0"'), "'2_0' is not a number"),
+        (arm(limit='<limit lower="-1" upper="1" velocity="1"/>'), "joint elbow: its <limit> lacks effort"),
+        (arm().replace('<robot name="r">', "<robot>"), "robot: has no name"),
         (arm(limit=""), "joint elbow: a revolute joint without <limit>"),
         (arm("planar"), "joint elbow: type 'planar' is not supported"),
         (arm().replace('<child link="arm"/>', '<child link="arn"/>'), "child link 'arn' does not exist"),
@@ -172,7 +192,7 @@ def test_bad_configurations_are_refused(ets_vii):
         ets_vii.coupling(np.where(np.arange(13) == 6, 2.0, q))
     with pytest.raises(ssm.InputError, match="velocity needs 12 finite numbers"):
         ets_vii.momentum(q, np.zeros(6))
-    with pytest.raises(ssm.InputError, match="not a rotation"):
+    with pytest.raises(ssm.InputError, match="is no rigid pose"):
         ets_vii.configuration(base_pose=2 * np.eye(4))
     with pytest.raises(ssm.InputError, match="homogeneous matrix"):
         ets_vii.configuration(base_pose=np.eye(3))

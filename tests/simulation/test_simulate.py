@@ -233,6 +233,8 @@ def test_a_target_out_of_reach_warns_by_how_much_and_runs(ets_vii):
         ({"dt": -0.1}, "dt is -0.1"),
         ({"dt": np.nan}, "dt is nan"),
         ({"duration": 0.0}, "duration is 0.0"),
+        ({"dt": 1e-12}, "more than 1e\\+08 steps; take a longer dt"),
+        ({"target": lambda time: TARGET}, "returns two things: position"),
         ({"dt": 20.0}, "dt is 20 s, longer than the duration of 10 s"),
         ({"method": "euler"}, "method 'euler' is unknown: use explicit, held, rk4"),
         ({"target": [0, 0, np.inf]}, r"target is \[0.0, 0.0, inf\]; it needs 3 finite numbers"),

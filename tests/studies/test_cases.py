@@ -206,6 +206,8 @@ def test_everything_a_case_can_say(write, tmp_path):
         (('axes = "yaw"', 'axes = "yow"'), "unknown protection 'yow'"),
         (('axes = "yaw"', "axes = [[0, 0, 1], [0, 0, 1]]"), "directions 1 and 2 of U_c are the same"),
         (('axes = "yaw"', "axes = [[0, 0]]"), "each direction needs 3 numbers"),
+        (('axes = "yaw"', "axes = [[1, 0, 0], [0, 1]]"), "each direction needs 3 numbers"),
+        (('axes = "yaw"', "axes = [[1, 0, 0], 1]"), "each direction needs 3 numbers"),
         (('axes = "yaw"', 'axes = "yaw"\nframe = "body"'), "frame is 'base' or 'inertial'"),
         (("[target]", "law = 3\n[target]"), r"'law' must be a table: write \[law\]"),
         (("[target]", "[start]\njoints = [0]\njoints_deg = [0]\n[target]"), "tables by joint name that share none"),

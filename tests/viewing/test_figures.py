@@ -168,4 +168,4 @@ def test_tables(compared):
     assert reasons[1] is not None or rows[1].outcome == "converged"
     stuck = explain(rows[-1])
     assert stuck.startswith("case3, reactionless, undamped: stalled at")
-    assert "Smallest singular value of J_g N_sub" in stuck
+    assert "Smallest singular value of J_gt N_sub" in stuck

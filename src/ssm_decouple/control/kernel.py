@@ -10,6 +10,7 @@ function must not call one that stands in another file.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numba
@@ -23,30 +24,25 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Callable[..., Any])
 
 
-def compiled_for(*signature: str) -> Callable[[F], F]:
+def compiled_for(*signature: str, inline: str = "never") -> Callable[[F], F]:
     """Compile with Numba and keep the machine code on disk.
 
     With a signature it is compiled for that one only: an array of another layout must not start a second compilation.
     """
 
     def decorate(function: F) -> F:
-        njit: Any = numba.njit
+        njit: Any = partial(numba.njit, *signature, inline=inline, error_model="numpy")
         try:
-            return cast(F, njit(*signature, cache=True, error_model="numpy")(function))
+            return cast(F, njit(cache=True)(function))
         except RuntimeError:  # no folder can be written: compile anew in each process
-            return cast(F, njit(*signature, error_model="numpy")(function))
+            return cast(F, njit()(function))
 
     return decorate
 
 
 compiled = compiled_for()
-
-
-def inlined(function: F) -> F:
-    """Compile into the caller: for what is called in one or two places, where a call would cost as much as the work."""
-    njit: Any = numba.njit
-    return cast(F, njit(inline="always", error_model="numpy")(function))
-
+# Compiled into the caller: for what is called in one or two places, where a call would cost as much as the work.
+inlined = compiled_for(inline="always")
 
 _MATRIX, _ROWS, _VECTOR = "float64[::1, :]", "float64[:, ::1]", "float64[::1]"
 # Pinocchio's matrices are stored by columns, everything else by rows.
@@ -66,12 +62,13 @@ WRONG_SIZE = 4
 PROTECTED_RATE = 0  # 3, the first k used
 POSITION = 3  # 3: end-effector, inertial axes
 ERROR = 6  # 3: target minus end-effector, inertial axes
-SMALLEST_SINGULAR_VALUE = 9  # of J_g N_sub
+SMALLEST_SINGULAR_VALUE = 9  # of J_gt N_sub
 RATE_SCALE = 10
 DAMPING = 11  # rho
 RANK = 12  # of J_sub
 RATE_BLEND = 13  # 1, or less where acceleration limits held the rates back
-RESULTS_SIZE = 14
+PLAN_CHANGE = 14  # relative change of the rates in the last pass of planning for a hold; 0 without a plan
+RESULTS_SIZE = 15
 
 # Where the scalars stand in `parameters`.
 GAIN = 0
@@ -96,7 +93,7 @@ MATRICES_SIZE = 12
 WORK_SIZE = MATRICES_SIZE + 9 + 12  # rows of scratch that one command needs
 
 EPS = 2.220446049250313e-16
-# A row of J_sub below this many rounding errors of J_rc constrains nothing: it is noise.
+# A row of J_sub below this many rounding errors of J_rc, a metre from the inertial origin, constrains nothing: noise.
 NOISE = 16.0 * EPS
 # Rates are scaled to just inside the limit, so that no later rounding lifts one above it.
 INSIDE = 1.0 - 8.0 * EPS
@@ -427,7 +424,7 @@ def solve(
     One Householder factorisation of [J_sub; J_g]^T carries the whole law. With Q its reflections in order, J_sub is
     lower triangular in the first r = rank(J_sub) coordinates of Q^T q_dot, so a rate that is zero in those lies in
     null(J_sub) whatever the others are. In the next three coordinates J_g is the lower triangular L (3, 3), whose
-    singular values are those of J_g N_sub, and min |L y - v_cmd|^2 + rho |y|^2 is the paper's objective.
+    singular values are those of J_gt N_sub, and min |L y - v_cmd|^2 + rho |y|^2 is the paper's objective.
     """
     n, k = columns.shape[1], U_c.shape[1]
     results = out[6 + n :]
@@ -446,7 +443,9 @@ def solve(
             rows[i, j] = J_sub[i, j]
         for r in range(3):
             rows[k + r, j] = matrices[J_TASK + r, j]
-    rank = factor_protected_rows(rows, weights, diagonal, order, k, NOISE * np.sqrt(scale))
+    # The matrices are sums about the inertial origin, so that their rounding grows with the distance from it.
+    far = 1.0 + abs(results[POSITION]) + abs(results[POSITION + 1]) + abs(results[POSITION + 2])
+    rank = factor_protected_rows(rows, weights, diagonal, order, k, NOISE * far * np.sqrt(scale))
     free = factor_task_rows(rows, weights, k, rank, L)
 
     for r in range(3):
@@ -467,6 +466,7 @@ def solve(
         for j in range(n):
             slow[j] = previous[j]
         take_out_leak(J_sub, rows, weights, diagonal, order, rank, leak, slow)
+        scale_to_limits(slow, columns)
         blend = largest_blend(slow, q_dot, previous, columns)
         for j in range(n):
             q_dot[j] = slow[j] + blend * (q_dot[j] - slow[j])
@@ -491,6 +491,7 @@ def solve(
     results[RATE_SCALE] = rate_scale
     results[RATE_BLEND] = blend
     results[RANK] = rank
+    results[PLAN_CHANGE] = 0.0
     return OK if np.isfinite(total) else NOT_FINITE
 
 
@@ -515,7 +516,7 @@ def selective_command(
     previous: Floats,
     out: Floats,
 ) -> int:
-    """Write q_dot = (J_g N_sub)^+ v_cmd and what follows from it into `out`; return OK or what is wrong.
+    """Write q_dot = (J_gt N_sub)^+ v_cmd and what follows from it into `out`; return OK or what is wrong.
 
     Args:
         A_g: Centroidal map (6, 6 + n), `pin.Data.Ag` after `pin.computeCentroidalMap`.
@@ -595,14 +596,14 @@ def add_matrices(
 
 
 @compiled
-def settled(rates: Floats, before: Floats, tolerance: float) -> bool:
-    """Say whether rates (n,) differ from those before by less than a share of the largest, and remember them there."""
+def change_of(rates: Floats, before: Floats) -> float:
+    """Return how far rates (n,) differ from those before, relative to the largest, and remember them there."""
     change, largest = 0.0, 0.0
     for j in range(rates.shape[0]):
         change = max(change, abs(rates[j] - before[j]))
         largest = max(largest, abs(rates[j]))
         before[j] = rates[j]
-    return change <= tolerance * largest
+    return change / largest if largest > 0.0 else change
 
 
 @compiled

@@ -9,7 +9,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import InputError, as_floats
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 
@@ -24,7 +24,7 @@ GAUSS: dict[int, tuple[tuple[float, float], ...]] = {
     2: ((0.5 - np.sqrt(3) / 6, 0.5), (0.5 + np.sqrt(3) / 6, 0.5)),
     3: ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 4 / 9), (0.5 + np.sqrt(15) / 10, 5 / 18)),
 }
-PASSES = 20  # at most; each gains a factor of about sample time x joint rate
+PASSES = 12  # at most; away from singularities each gains a factor of about sample time x joint rate
 CONVERGED = 1e-13  # relative change of the rates from pass to pass
 
 
@@ -81,7 +81,7 @@ class Command:
 
     @property
     def smallest_singular_value(self) -> float:
-        """Smallest singular value of J_g N_sub: m/s of end-effector per rad/s in the hardest direction."""
+        """Smallest singular value of J_gt N_sub: m/s of end-effector per rad/s in the hardest direction."""
         return float(self._results(kernel.SMALLEST_SINGULAR_VALUE)[0])
 
     @property
@@ -98,6 +98,11 @@ class Command:
     def rate_blend(self) -> float:
         """Share in [0, 1] of the way from the previous rates to the wanted ones that acceleration limits allowed."""
         return float(self._results(kernel.RATE_BLEND)[0])
+
+    @property
+    def plan_change(self) -> float:
+        """Relative change of the rates in the last pass of planning for the hold: above 1e-13 it has not settled."""
+        return float(self._results(kernel.PLAN_CHANGE)[0])
 
     @property
     def regularised(self) -> bool:
@@ -123,12 +128,14 @@ class Command:
 
 
 class SelectiveLaw:
-    """The paper's law: q_dot = (J_g N_sub)^+ (x_dot_des + k_p (x_des - x)), scaled to the rate limits (eq. 9, 17).
+    """The paper's law: q_dot = (J_gt N_sub)^+ (x_dot_des + k_p (x_des - x)), scaled as a whole to the rate limits.
+
+    Equations 9 and 17; the paper gives the limits and leaves open how they are kept.
 
     The rates lie in null(J_sub) to machine precision, whatever the damping and the scaling do: the command is made
     inside that null space, and the whole vector is scaled instead of joint by joint.
 
-    Near a singularity of J_g N_sub the plain inverse would ask for unbounded rates. Where the smallest singular value
+    Near a singularity of J_gt N_sub the plain inverse would ask for unbounded rates. Where the smallest singular value
     s falls below `damping_threshold`, rho = `damping` (1 - (s / threshold)^2)^2 enters the paper's objective (eq. 11)
     smoothly; above it the answer is the exact minimum-norm one.
 
@@ -147,9 +154,11 @@ class SelectiveLaw:
         damping: rho at a singularity, m2; 0 gives the Moore-Penrose inverse everywhere.
         damping_threshold: Smallest singular value, m, below which rho enters.
         sample_time: How long a command is held, s; needed for the two that follow.
-        hold_nodes: 0 poses the law at the sample (the paper's), 1 to 3 on matrices averaged over the hold.
+        hold_nodes: 0 poses the law at the sample, 1 to 3 on matrices averaged over the hold.
         acceleration_limit: Largest joint accelerations, rad/s2 or m/s2, from one command to the next: one number, an
-            array (n,), or None. The rates are blended from the previous ones within null(J_sub).
+            array (n,), or None. The rates are blended from the previous ones within null(J_sub). The protection comes
+            first, then the rate limits: where they take more than the acceleration limit allows, it is exceeded and
+            the command's `rate_blend` is 0. The law does not brake ahead.
 
     Attributes:
         size: Length of the array that `evaluate` fills.
@@ -174,22 +183,20 @@ class SelectiveLaw:
         n = robot.n_joints
         if n == 0:
             raise InputError(f"'{robot.name}' has no joints to command; put an arm on it with compose(..)")
-        period = np.inf if sample_time is None else sample_time
-        for name, value in (("gain", gain), ("damping_threshold", damping_threshold), ("sample_time", period)):
-            if not ((np.isfinite(value) or value is np.inf) and value > 0):
-                raise InputError(f"{name} is {value}; it must be a positive number")
-        if not (np.isfinite(damping) and damping >= 0):
+        if not isinstance(protection, Protection):
+            raise InputError(f"protection is {protection!r}; give a Protection, such as Protection('yaw')")
+        if not (_finite("damping", damping) >= 0):
             raise InputError(f"damping is {damping}; it must be zero or a positive number")
-        if hold_nodes not in GAUSS:
+        if not (isinstance(hold_nodes, int) and hold_nodes in GAUSS):
             raise InputError(f"hold_nodes is {hold_nodes}; it is 0 (at the sample), 1, 2 or 3")
         if sample_time is None and (hold_nodes or acceleration_limit is not None):
             raise InputError("hold_nodes and acceleration_limit need the sample_time, s, for which a command is held")
         self.robot = robot
         self.protection = protection
-        self.gain = float(gain)
+        self.gain = _positive("gain", gain)
         self.damping = float(damping)
-        self.damping_threshold = float(damping_threshold)
-        self.sample_time = sample_time
+        self.damping_threshold = _positive("damping_threshold", damping_threshold)
+        self.sample_time = None if sample_time is None else _positive("sample_time", sample_time)
         self.hold_nodes = hold_nodes
         self.rate_limits: Floats = _limits(robot, "rate_limit", robot.rate_limits if rate_limit is None else rate_limit)
         self.acceleration_limits: Floats | None = None
@@ -217,6 +224,7 @@ class SelectiveLaw:
         views = (data.Ag, data.J, placement.rotation, placement.translation)
         constants = (self.protection.U_c.copy(), columns, parameters)
         self._prepared = (model, data, views, constants, (*views, *constants))
+        self._continuous = any(joint.nq == 2 for joint in model.joints[2:])
         self._no_rates: Floats = np.zeros(n)
         self._J_base: Floats = np.zeros((6, n))
         self._matrices: Floats = np.zeros((kernel.MATRICES_SIZE, n))
@@ -268,6 +276,8 @@ class SelectiveLaw:
         Raises:
             InputError: as for the call.
         """
+        if self._continuous:
+            q = self.robot.checked(q)  # the kernel sees matrices, not whether cosine and sine fit
         if previous_rates is None:
             if self.acceleration_limits is not None:
                 raise InputError("an acceleration limit needs previous_rates: those commanded before, zeros from rest")
@@ -295,30 +305,51 @@ class SelectiveLaw:
         return self._J_base @ joint_rates
 
     def _hold(self, q: ArrayLike, target: Floats, target_velocity: Floats, previous: Floats, out: Floats) -> int:
-        """Replace the command at the sample in `out` by the one for the hold, found by fixed-point iteration."""
-        model, data, views, constants, fixed = self._prepared
-        hold = float(self.sample_time or 0.0)
-        velocity, matrices = out[: model.nv], self._matrices
+        """Replace the command at the sample in `out` by the one for the hold.
+
+        Mean matrices and command are found together by fixed-point iteration. Near a singularity the command answers so
+        strongly to the matrices that this need not settle; then the task is given up for this hold, and the last rates
+        are only projected on the null space of the mean J_sub, again and again, which settles.
+        """
+        model, _, views, (U_c, columns, parameters), _ = self._prepared
+        velocity, results = out[: model.nv], out[model.nv :]
         kernel.base_twist_map(views[0], self._J_base)  # at the sample, as is the base twist that the command tells
-        told = out[model.nv + kernel.POSITION : model.nv + kernel.ERROR + 3]
-        at_sample, position = told.copy(), told[:3]
-        middle = target + 0.5 * hold * target_velocity
-        status, before = kernel.OK, velocity[6:].copy()
+        told = results[kernel.POSITION : kernel.ERROR + 3]
+        at_sample = told.copy()
+        vectors = (target + 0.5 * float(self.sample_time or 0.0) * target_velocity, target_velocity)
+        status, change = self._plan(q, (U_c, columns, parameters, *vectors, previous), out)
+        if status == kernel.OK and change > CONVERGED:
+            # A blend of nothing with the given rates, in the kernel's words: their projection.
+            columns, parameters, kept = columns.copy(), parameters.copy(), results.copy()
+            columns[kernel.RATE_STEP], parameters[kernel.LIMITS_STEPS] = 0.0, 1.0
+            status, change = self._plan(q, (U_c, columns, parameters, *vectors, velocity[6:].copy()), out)
+            kept[: kernel.POSITION] = results[: kernel.POSITION]
+            results[:] = kept
+        told[:] = at_sample  # position and error, as the base twist
+        results[kernel.PLAN_CHANGE] = change
+        return status
+
+    def _plan(self, q: ArrayLike, arguments: tuple[Any, Any, Any, Any, Any, Any], out: Floats) -> tuple[int, float]:
+        """Iterate on mean matrices and command; return the status and the last relative change of the rates."""
+        model, data, _, _, fixed = self._prepared
+        hold, matrices = float(self.sample_time or 0.0), self._matrices
+        velocity, position = out[: model.nv], out[model.nv + kernel.POSITION :][:3]
+        status, change, before = kernel.OK, np.inf, velocity[6:].copy()
         for _ in range(PASSES):
             matrices[:] = 0.0
             position[:] = 0.0
             for node, weight in GAUSS[self.hold_nodes]:
                 pin.computeCentroidalMap(model, data, pin.integrate(model, q, node * hold * velocity))
                 status = status or kernel.add_matrices(*fixed, weight, matrices, position)
-            status = status or kernel.held_command(matrices, *constants, middle, target_velocity, previous, out)
+            status = status or kernel.held_command(matrices, *arguments, out)
             velocity[:6] = self._J_base @ velocity[6:]
-            if status != kernel.OK or kernel.settled(velocity[6:], before, CONVERGED):
+            change = kernel.change_of(velocity[6:], before)
+            if status != kernel.OK or change <= CONVERGED:
                 break
-        told[:] = at_sample  # position and error, as the base twist
-        return status
+        return status, change
 
     def _checked_rates(self, rates: ArrayLike) -> Floats:
-        values = np.array(rates, dtype=float)
+        values = as_floats("previous_rates", rates)
         if values.shape != (self.robot.n_joints,) or not np.all(np.isfinite(values)):
             raise InputError(f"previous_rates needs {self.robot.n_joints} finite joint rates, not shape {values.shape}")
         return values
@@ -362,15 +393,29 @@ class SelectiveLaw:
         }
 
 
+def _finite(name: str, value: float) -> float:
+    number = as_floats(name, value)
+    if number.shape != () or not np.isfinite(number):
+        raise InputError(f"{name} is {value}; it must be one finite number")
+    return float(number)
+
+
+def _positive(name: str, value: float) -> float:
+    number = _finite(name, value)
+    if not number > 0:
+        raise InputError(f"{name} is {value}; it must be a positive number")
+    return number
+
+
 def _vector(name: str, value: ArrayLike) -> Floats:
-    vector = np.array(value, dtype=float)
+    vector = as_floats(name, value)
     if vector.shape != (3,):
         raise InputError(f"{name} has shape {vector.shape}; it needs 3 numbers, m or m/s in inertial axes")
     return vector
 
 
 def _limits(robot: Robot, name: str, given: ArrayLike) -> Floats:
-    limits = np.array(given, dtype=float)
+    limits = as_floats(name, given)
     if limits.shape not in ((), (robot.n_joints,)):
         raise InputError(f"{name} has shape {limits.shape}; give one number or one for each of {robot.n_joints} joints")
     if not np.all(limits > 0):

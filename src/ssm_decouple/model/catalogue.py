@@ -34,8 +34,8 @@ def find_urdf(source: str | Path) -> Path:
     path = Path(source).expanduser()
     if path.is_file():
         return path
-    kind = "is a folder" if path.is_dir() else "is neither a file"
-    raise ModelError(f"'{source}' {kind} nor a robot of the catalogue ({', '.join(catalogue)})")
+    kind = "is a folder, not a URDF file" if path.is_dir() else "is neither a file nor a robot of the catalogue"
+    raise ModelError(f"'{source}' {kind} ({', '.join(catalogue)})")
 
 
 def load_robot(source: str | Path, end_effector: str | None = None) -> Robot:

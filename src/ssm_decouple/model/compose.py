@@ -10,9 +10,9 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from ssm_decouple.errors import InputError, ModelError
+from ssm_decouple.errors import ModelError, as_floats
 from ssm_decouple.model.catalogue import find_urdf
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.model.robot import Robot, rigid_pose
 from ssm_decouple.model.urdf import parse_urdf, read_urdf, root_link, tip_links
 
 
@@ -110,14 +110,12 @@ def _refuse_collisions(whole: ET.Element, part: ET.Element, bus_name: str, arm_n
 
 
 def _pose(mount: pin.SE3 | ArrayLike) -> pin.SE3:
-    if isinstance(mount, pin.SE3):
-        return mount
-    values = np.asarray(mount, dtype=float)
-    if values.shape == (3,) and np.all(np.isfinite(values)):
-        return pin.SE3(np.eye(3), values)
-    if values.shape == (4, 4) and np.all(np.isfinite(values)):
-        return pin.SE3(values)
-    raise InputError(f"mount is a pinocchio.SE3, a matrix (4, 4) or a position (3,), finite; not {values.tolist()}")
+    if not isinstance(mount, pin.SE3):
+        values = as_floats("mount", mount)
+        if values.shape == (3,):
+            mount = np.eye(4)
+            mount[:3, 3] = values
+    return rigid_pose("mount", mount)
 
 
 def _fixed_joint(parent: str, child: str, pose: pin.SE3) -> ET.Element:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -10,7 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_decouple.errors import DecoupleWarning, InputError, ModelError
+from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, as_floats
 from ssm_decouple.model.urdf import inspect_urdf, parse_urdf, root_link, tip_links
 
 if TYPE_CHECKING:
@@ -69,6 +70,7 @@ class Robot:
             self.model: pin.Model = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
         except (ValueError, RuntimeError) as error:
             raise ModelError(f"robot '{name}': Pinocchio cannot read it: {error}") from error
+        self._refuse_lost_mass(root)
         self._data: pin.Data = self.model.createData()
         self._neutral: Floats = pin.neutral(self.model)
         self.n_joints: int = self.model.nv - 6
@@ -76,7 +78,7 @@ class Robot:
         self.link_names: tuple[str, ...] = tuple(f.name for f in self.model.frames if f.type == pin.FrameType.BODY)
         self.mass: float = pin.computeTotalMass(self.model)
         self.end_effector = self._choose_end_effector(end_effector, tip_links(root), root_link(root))
-        self.end_effector_id: int = self.model.getFrameId(self.end_effector)
+        self.end_effector_id: int = self._frame_id(self.end_effector)
         rates = np.array(self.model.velocityLimit[6:])
         self.rate_limits: Floats = np.where((rates > 0) & (rates < UNLIMITED), rates, np.inf)
         self.position_limits: Floats = self._read_position_limits()
@@ -104,6 +106,23 @@ class Robot:
             if joint.nq == 1:
                 limits[i] = self.model.lowerPositionLimit[joint.idx_q], self.model.upperPositionLimit[joint.idx_q]
         return limits
+
+    def _frame_id(self, name: str) -> int:
+        """Return the index of a link's frame, else of any other; a joint and a link may share a name."""
+        for kinds in (pin.FrameType.BODY, pin.FrameType.OP_FRAME, pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT):
+            if self.model.existFrame(name, kinds):
+                return int(self.model.getFrameId(name, kinds))
+        raise InputError(f"'{self.name}' has no frame '{name}'; its links are {', '.join(self.link_names)}")
+
+    def _refuse_lost_mass(self, root: ET.Element) -> None:
+        """Pinocchio drops an inertia that it cannot read without a word; its sum tells."""
+        written = sum(float(mass.get("value", "0")) for mass in root.findall("link/inertial/mass"))
+        read = float(pin.computeTotalMass(self.model))
+        if abs(read - written) > 1e-9 * written:
+            raise ModelError(
+                f"robot '{self.name}': its links weigh {written:g} kg but Pinocchio reads {read:g} kg of them; an "
+                "<inertial> is malformed"
+            )
 
     def _refuse_singular_inertia(self) -> None:
         pin.computeCentroidalMap(self.model, self._data, self._neutral)
@@ -137,9 +156,9 @@ class Robot:
         displacement = np.zeros(self.model.nv)
         if isinstance(joints, Mapping):
             for name, value in joints.items():
-                displacement[6 + self.joint_index(name)] = value
+                displacement[6 + self.joint_index(name)] = as_floats(f"joint position {name}", value)
         elif joints is not None:
-            values = np.asarray(joints, dtype=float)
+            values = as_floats("joint positions", joints)
             if values.shape != (self.n_joints,):
                 raise InputError(
                     f"joint positions have shape {values.shape}, '{self.name}' needs ({self.n_joints},): "
@@ -151,7 +170,7 @@ class Robot:
             raise InputError(f"joint positions are not finite at {', '.join(bad)}")
         q: Floats = pin.integrate(self.model, self._neutral, displacement)
         if base_pose is not None:
-            q[:7] = pin.SE3ToXYZQUAT(_rigid_pose(base_pose))
+            q[:7] = pin.SE3ToXYZQUAT(rigid_pose("base_pose", base_pose))
         return q
 
     def joint_index(self, name: str) -> int:
@@ -175,7 +194,7 @@ class Robot:
         Raises:
             InputError: wrong length, not finite, or its quaternion q[3:7] is not of unit length.
         """
-        values = np.asarray(q, dtype=float)
+        values = as_floats("configuration", q)
         if values.shape != (self.model.nq,):
             raise InputError(
                 f"configuration has shape {values.shape}, '{self.name}' needs ({self.model.nq},); "
@@ -188,6 +207,13 @@ class Robot:
         length = float(np.linalg.norm(values[3:7]))
         if abs(length - 1.0) > 1e-6:
             raise InputError(f"quaternion q[3:7] has length {length:.7g}, not 1; use pinocchio.normalize(model, q)")
+        for joint in self.model.joints[2:]:
+            if joint.nq == 2 and abs(float(np.hypot(*values[joint.idx_q : joint.idx_q + 2])) - 1.0) > 1e-6:
+                raise InputError(
+                    f"continuous joint '{self.model.names[joint.id]}' takes cosine and sine, q[{joint.idx_q}:"
+                    f"{joint.idx_q + 2}] is {values[joint.idx_q : joint.idx_q + 2].tolist()}; build q with "
+                    "robot.configuration(..)"
+                )
         return values
 
     def base_pose(self, q: ArrayLike) -> pin.SE3:
@@ -196,9 +222,7 @@ class Robot:
 
     def frame_pose(self, q: ArrayLike, frame: str | None = None) -> pin.SE3:
         """Return the pose of a frame, by default the end-effector's, in the inertial frame."""
-        index = self.end_effector_id if frame is None else self.model.getFrameId(frame)
-        if index >= self.model.nframes:
-            raise InputError(f"'{self.name}' has no frame '{frame}'")
+        index = self.end_effector_id if frame is None else self._frame_id(frame)
         pin.framesForwardKinematics(self.model, self._data, self.checked(q))
         return self._data.oMf[index].copy()
 
@@ -261,20 +285,21 @@ class Robot:
         return Report.of_robot(self)
 
 
-def _rigid_pose(pose: pin.SE3 | ArrayLike) -> pin.SE3:
-    if isinstance(pose, pin.SE3):
-        matrix = pose.homogeneous
-    else:
-        matrix = np.asarray(pose, dtype=float)
-        if matrix.shape != (4, 4):
-            raise InputError(f"a pose is a pinocchio.SE3 or a homogeneous matrix (4, 4), not shape {matrix.shape}")
+def rigid_pose(name: str, pose: pin.SE3 | ArrayLike) -> pin.SE3:
+    """Return a pose given as a `pin.SE3` or as a homogeneous matrix (4, 4).
+
+    Raises:
+        InputError: it is neither, not finite, or its rotation is none.
+    """
+    matrix = pose.homogeneous if isinstance(pose, pin.SE3) else as_floats(name, pose)
+    if matrix.shape != (4, 4):
+        raise InputError(f"{name} is a pinocchio.SE3 or a homogeneous matrix (4, 4), not shape {matrix.shape}")
+    if not np.all(np.isfinite(matrix)):
+        raise InputError(f"{name} is not finite: {matrix.tolist()}")
     rotation = matrix[:3, :3]
-    if (
-        not np.all(np.isfinite(matrix))
-        or np.linalg.norm(rotation.T @ rotation - np.eye(3)) > 1e-6
-        or np.linalg.det(rotation) < 0
-    ):
+    proper = np.linalg.norm(rotation.T @ rotation - np.eye(3)) < 1e-6 and np.linalg.det(rotation) > 0
+    if not proper or not np.array_equal(matrix[3], [0, 0, 0, 1]):
         raise InputError(
-            "the pose's rotation block is not a rotation: its columns must be right-handed and orthonormal"
+            f"{name} is no rigid pose: its rotation needs right-handed orthonormal columns, its last row 0 0 0 1"
         )
     return pin.SE3(rotation, matrix[:3, 3])

@@ -66,17 +66,46 @@ def parse_urdf(text: str, source: str) -> ET.Element:
     return root
 
 
+def number(text: str) -> float:
+    """Parse a number as C++ does: Python alone would take 1_0 for ten."""
+    if "_" in text:
+        raise ValueError(f"'{text}' is not a number")
+    return float(text)
+
+
 def floats(text: str | None, default: tuple[float, ...]) -> NDArray[np.float64]:
     """Parse a URDF attribute such as xyz="0 0 1"."""
-    return np.array(default if text is None else [float(word) for word in text.split()])
+    return np.array(default if text is None else [number(word) for word in text.split()])
 
 
 def inspect_urdf(root: ET.Element) -> list[Finding]:
     """Say everything that is impossible, suspicious or worth a note in a parsed URDF."""
     try:
-        return [*_inspect_tree(root), *_inspect_joints(root), *_inspect_inertias(root)]
-    except (ValueError, TypeError) as error:
+        tree = _inspect_tree(root)
+        return [*tree, *_inspect_places(root), *_inspect_joints(root), *_inspect_inertias(root)]
+    except (ValueError, TypeError, AttributeError) as error:
         return [Finding("impossible", "file", f"a number or a name is missing or malformed ({error})")]
+
+
+def _inspect_places(root: ET.Element) -> list[Finding]:
+    found = [] if root.get("name") else [Finding("impossible", "robot", 'has no name: write <robot name="..">')]
+    for kind in ("joint", "link"):
+        for element in root.findall(kind):
+            for origin in element.findall("origin" if kind == "joint" else "inertial/origin"):
+                for key in ("xyz", "rpy"):
+                    where, given = f"{kind} {element.get('name')}", origin.get(key)
+                    if given is not None and not _three_numbers(given):
+                        place = f'<origin {key}="{given}"> needs 3 finite numbers'
+                        found.append(Finding("impossible", where, place))
+    return found
+
+
+def _three_numbers(text: str) -> bool:
+    try:
+        values = floats(text, ())
+    except ValueError:
+        return False
+    return values.shape == (3,) and bool(np.all(np.isfinite(values)))
 
 
 def _inspect_tree(root: ET.Element) -> list[Finding]:
@@ -109,6 +138,12 @@ def _inspect_tree(root: ET.Element) -> list[Finding]:
         roots = [link for link in links if link not in parents]
         if len(roots) != 1:
             found.append(Finding("impossible", "robot", f"needs exactly one root link, has {roots or 'a loop'}"))
+        reached = set(roots)
+        while more := {child for child, parent in parents.items() if parent in reached} - reached:
+            reached |= more
+        if len(roots) == 1 and len(reached) < len(links):
+            lost = ", ".join(link for link in links if link not in reached)
+            found.append(Finding("impossible", "robot", f"links {lost} form a loop, away from the root '{roots[0]}'"))
     return found
 
 
@@ -124,6 +159,10 @@ def _inspect_joints(root: ET.Element) -> list[Finding]:
             continue
         if joint.find("mimic") is not None:
             found.append(Finding("suspicious", where, "<mimic> is not followed: the joint moves on its own"))
+        axis = joint.find("axis")
+        given = "1 0 0" if axis is None else axis.get("xyz", "")
+        if not _three_numbers(given) or not np.any(floats(given, ())):
+            found.append(Finding("impossible", where, f'<axis xyz="{given}"> needs 3 finite numbers, not all zero'))
         limit = joint.find("limit")
         if limit is None:
             if kind == "continuous":
@@ -132,9 +171,13 @@ def _inspect_joints(root: ET.Element) -> list[Finding]:
                 advice = 'add <limit lower=".." upper=".." effort=".." velocity=".."/> or make it continuous'
                 found.append(Finding("impossible", where, f"a {kind} joint without <limit>; {advice}"))
             continue
-        if not float(limit.get("velocity", "0")) > 0:
+        lacking = [key for key in ("effort", "velocity") if limit.get(key) is None]
+        if lacking:
+            found.append(Finding("impossible", where, f"its <limit> lacks {' and '.join(lacking)}"))
+            continue
+        if not number(limit.get("velocity", "")) > 0:
             found.append(Finding("suspicious", where, "no velocity limit above zero: give the law a rate_limit"))
-        lower, upper = float(limit.get("lower", "0")), float(limit.get("upper", "0"))
+        lower, upper = number(limit.get("lower", "0")), number(limit.get("upper", "0"))
         if kind != "continuous" and not upper > lower:
             found.append(Finding("suspicious", where, f"position limits [{lower:g}, {upper:g}] leave it no room"))
     return found
@@ -182,7 +225,7 @@ def _attribute(element: ET.Element, child: str, name: str) -> float:
     found = element.find(child)
     if found is None or found.get(name) is None:
         raise ValueError(f"<{element.tag}> lacks <{child} {name}=..>")
-    return float(found.get(name, ""))
+    return number(found.get(name, ""))
 
 
 def _inertia_matrix(inertial: ET.Element) -> NDArray[np.float64]:
@@ -265,6 +308,8 @@ def _shape(visual: ET.Element, link: str, palette: dict[str | None, ET.Element |
         element = visual.find(f"geometry/{kind}")
         if element is not None:
             size = tuple(float(x) for name in attributes for x in floats(element.get(name), ()))
+            if len(size) != {"box": 3, "cylinder": 2, "sphere": 1}[kind]:
+                return None  # a malformed shape is no reason to refuse a figure
             xyz, rpy = (floats(place.get(key), (0.0, 0.0, 0.0)) for key in ("xyz", "rpy"))
             return Shape(visual.get("name", ""), link, kind, size, xyz, rpy, (red, green, blue))
     return None

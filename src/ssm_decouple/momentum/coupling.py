@@ -53,7 +53,10 @@ class Coupling:
         Raises:
             InputError: q has the wrong length or is not finite.
         """
-        model, data, configuration = robot.model, robot.model.createData(), robot.checked(q)
+        model, data, configuration = robot.model, robot.model.createData(), robot.checked(q).copy()
+        # No matrix depends on where the base is, but sums about a far origin would round more.
+        position = configuration[:3].copy()
+        configuration[:3] = 0.0
         pin.computeCentroidalMap(model, data, configuration)
         pin.updateFramePlacement(model, data, robot.end_effector_id)
         J_frame = pin.getFrameJacobian(model, data, robot.end_effector_id, pin.LOCAL_WORLD_ALIGNED)
@@ -67,7 +70,7 @@ class Coupling:
             J_rc=_fixed(J_base[3:].copy()),
             J_base=_fixed(J_base),
             J_g=_fixed(J_frame[:, 6:] + J_frame[:, :6] @ J_base),
-            centre_of_mass=_fixed(np.array(data.com[0])),
+            centre_of_mass=_fixed(data.com[0] + position),
             base_rotation=_fixed(R),
             mass=robot.mass,
         )

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import AT_REST, SelectiveLaw
-from ssm_decouple.errors import DecoupleWarning, InputError
+from ssm_decouple.errors import DecoupleWarning, InputError, as_floats
 from ssm_decouple.simulation.motion import build_motion, judge
 from ssm_decouple.simulation.steps import STEPS, Reference
 
@@ -20,6 +20,9 @@ Floats = NDArray[np.float64]
 Method = Literal["explicit", "held", "rk4"]
 Target = Callable[[float], tuple[ArrayLike, ArrayLike]]
 Progress = Callable[[float], object]
+
+
+MOST_STEPS = 1e8  # a record of more would not fit into memory
 
 
 class SimulationInterrupted(KeyboardInterrupt):
@@ -50,10 +53,10 @@ def simulate(
             and velocity.
         duration: Length of the motion, s.
         dt: Time between samples, s. A last shorter step is taken where `duration` is no multiple of it.
-        method: "explicit" holds joint rates and base twist for one step (the paper's). "held" holds the joint rates, as
-            a perfect servo does, and moves the base exactly in between, by a sixth-order Magnus expansion: the truth
-            for a sampled law. "rk4" is a fourth-order Lie-group Runge-Kutta method that calls the law within the step
-            too, and so integrates the law in continuous time.
+        method: "explicit" holds joint rates and base twist for one step, how we read the paper. "held" holds the joint
+            rates, as a perfect servo does, and moves the base exactly in between, by a sixth-order Magnus expansion:
+            the truth for a sampled law. "rk4" is a fourth-order Lie-group Runge-Kutta method that calls the law within
+            the step too, and so integrates the law in continuous time.
         arrival_tolerance: Distance, m, within which the end-effector has arrived.
         stop_early: End when the end-effector has arrived or has stalled instead of after `duration`.
         progress: Called now and then with the share done, 0 to 1.
@@ -63,7 +66,7 @@ def simulate(
         `long_name`. Variables: configuration, joint_positions, joint_rates, base_position, base_quaternion, base_rpy,
         base_linear_velocity, base_angular_velocity, base_rotation_integral, protected_rate, protected_angle,
         end_effector_position, target_position, end_effector_error, smallest_singular_value, rate_scale, rate_blend,
-        damping, linear_momentum, angular_momentum, centre_of_mass, U_c, robot_urdf. Attributes: `outcome`
+        plan_change, damping, linear_momentum, angular_momentum, centre_of_mass, U_c, robot_urdf. Attributes: `outcome`
         ("converged", "stalled" or "running"), `outcome_time` (s), `final_error` (m), the law's settings, the method
         and the versions.
 
@@ -74,7 +77,7 @@ def simulate(
     time = _sample_times(duration, dt)
     if method not in STEPS:
         raise InputError(f"method '{method}' is unknown: use {', '.join(STEPS)}")
-    _refuse_unfit_method(law, method, dt)
+    _refuse_unfit_method(law, method, duration, dt)
     if not (np.isfinite(arrival_tolerance) and arrival_tolerance > 0):
         raise InputError(f"arrival_tolerance is {arrival_tolerance}; it must be a positive distance, m")
     robot = law.robot
@@ -132,9 +135,13 @@ def simulate(
     return record()
 
 
-def _refuse_unfit_method(law: SelectiveLaw, method: str, dt: float) -> None:
+def _refuse_unfit_method(law: SelectiveLaw, method: str, duration: float, dt: float) -> None:
     if law.sample_time is not None and abs(law.sample_time - dt) > 1e-9 * dt:
         raise InputError(f"the law's sample_time is {law.sample_time:g} s, dt is {dt:g} s; they must be the same")
+    if law.sample_time is not None and abs(duration / dt - round(duration / dt)) > 1e-9 * duration / dt:
+        raise InputError(
+            f"duration {duration:g} s is no whole number of steps of {dt:g} s, for each of which the law plans"
+        )
     if law.hold_nodes and method != "held":
         raise InputError(
             f"a law with hold_nodes plans for joint rates that are held: use method 'held', not '{method}'"
@@ -149,6 +156,8 @@ def _sample_times(duration: float, dt: float) -> Floats:
             raise InputError(f"{name} is {value}; it must be a positive time, s")
     if dt > duration:
         raise InputError(f"dt is {dt:g} s, longer than the duration of {duration:g} s")
+    if duration / dt > MOST_STEPS:
+        raise InputError(f"{duration:g} s in steps of {dt:g} s are more than {MOST_STEPS:g} steps; take a longer dt")
     steps = int(np.ceil(duration / dt * (1 - 1e-12)))
     time = float(dt) * np.arange(steps + 1, dtype=np.float64)
     time[-1] = duration
@@ -159,7 +168,10 @@ def _reference(target: ArrayLike | Target) -> Reference:
     if callable(target):
 
         def moving(time: float) -> tuple[Floats, Floats]:
-            position, velocity = target(time)
+            try:
+                position, velocity = target(time)
+            except (TypeError, ValueError):
+                raise InputError("a target function returns two things: position (3,) and velocity (3,)") from None
             return _point(position, "target position"), _point(velocity, "target velocity")
 
         return moving
@@ -168,7 +180,7 @@ def _reference(target: ArrayLike | Target) -> Reference:
 
 
 def _point(value: ArrayLike, name: str) -> Floats:
-    point = np.array(value, dtype=float)
+    point = as_floats(name, value)
     if point.shape != (3,) or not np.all(np.isfinite(point)):
         raise InputError(f"{name} is {point.tolist()}; it needs 3 finite numbers, inertial axes")
     return point

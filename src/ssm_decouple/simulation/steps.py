@@ -24,7 +24,7 @@ _JUDGE = [(0.5 + 0.5 * node, 0.5 * weight) for node, weight in zip(*np.polynomia
 def explicit(
     law: SelectiveLaw, reference: Reference, q: Floats, values: Floats, t: float, t_next: float
 ) -> tuple[Floats, Floats]:
-    """Hold joint rates and base twist, as the paper does."""
+    """Hold joint rates and base twist: one Euler step on SE(3), how we read the paper."""
     model, h = law.robot.model, t_next - t
     return pin.integrate(model, q, h * values[: model.nv]), h * values[3:6]
 

@@ -17,7 +17,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import DecoupleError, InputError
+from ssm_decouple.errors import DecoupleError, InputError, as_floats
 from ssm_decouple.model.catalogue import load_robot, models
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
@@ -143,9 +143,12 @@ class Case:
         Raises:
             DecoupleError: the case cannot be run; the message says why.
         """
-        law = self.make_law(protection, dt)
         step = self.dt if dt is None else dt
-        motion = simulate(law, self.start(), self.target, self.duration, step, progress=progress, **self.simulation)
+        try:
+            law, start = self.make_law(protection, dt), self.start()
+            motion = simulate(law, start, self.target, self.duration, step, progress=progress, **self.simulation)
+        except InputError as error:
+            raise InputError(f"case '{self.name}': {error}") from error
         motion.attrs |= {
             "case": self.name,
             "title": self.title,
@@ -176,7 +179,11 @@ def load_case(source: str | Path) -> Case:
     """
     catalogue = cases()
     path = catalogue.get(str(source), Path(source).expanduser())
-    if not path.is_file():
+    try:
+        found = path.is_file()
+    except OSError:  # a name too long to be one
+        found = False
+    if not found:
         raise InputError(f"'{source}' is neither a file nor one of the cases {', '.join(catalogue)}")
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
@@ -238,10 +245,10 @@ def _joints(start: Mapping[str, Any]) -> Floats | dict[str, float] | None:
 
 def _directions(axes: list[Any]) -> Floats:
     """Turn a case file's directions, one in a row, into the columns of U_c."""
-    rows = np.array(axes if axes and isinstance(axes[0], list) else [axes], dtype=float)
-    if rows.ndim != 2 or rows.shape[1] != 3:
+    rows = axes if axes and all(isinstance(row, list) for row in axes) else [axes]
+    if any(len(row) != 3 or any(isinstance(x, list) for x in row) for row in rows):
         raise InputError(f"[protection] axes {axes}: each direction needs 3 numbers")
-    return rows.T
+    return as_floats("[protection] axes", rows).T
 
 
 def _validate(content: dict[str, Any]) -> None:

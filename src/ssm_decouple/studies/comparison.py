@@ -40,7 +40,7 @@ class Summary:
         roll_deg: Base roll, peak to peak.
         pitch_deg: Base pitch, peak to peak.
         yaw_deg: Base yaw, peak to peak.
-        sigma_min_m: Smallest singular value of J_g N_sub over the motion.
+        sigma_min_m: Smallest singular value of J_gt N_sub over the motion.
         sigma_min_time_s: When.
         damped_share: Share of the samples in which rho was above zero.
         rate_limited_share: Share of the samples in which the rates were scaled down to the limits.

@@ -124,7 +124,7 @@ def comparison(motions: Mapping[str, xr.Dataset]) -> Figure:
     disturbed.set(
         title="rate about the protected axes", ylabel=r"$|\omega_\mathrm{sub}|$ (rad/s)", ylim=(FLOOR / 3, 1e-1)
     )
-    singular.set(title=r"smallest singular value of $J_g N_\mathrm{sub}$", ylabel="m")
+    singular.set(title=r"smallest singular value of $J_{g,t} N_\mathrm{sub}$", ylabel="m")
     for axis, name in zip(angles, AXIS_COLORS, strict=True):
         axis.set(title=f"base {name}", ylabel="deg", xlabel="time (s)")
     low = min(axis.get_ylim()[0] for axis in angles)

@@ -18,15 +18,14 @@ def cells(row: Summary) -> tuple[str, ...]:
     """Return a summary as the table's texts, in the order of HEADINGS.
 
     "left" is the distance to the target at the end, |w_sub| the largest base rate about the directions that the case
-    protects, the angles are peak to peak, sigma is the smallest singular value of J_g N_sub over the motion.
+    protects, the angles are peak to peak, sigma is the smallest singular value of J_gt N_sub over the motion.
     """
-    ended = {"converged": "arrived", "stalled": "stalled", "running": "still moving"}[row.outcome]
     left = 1e3 * row.final_error_m
     return (
         row.case,
         row.law,
         str(row.k),
-        f"{ended}, {row.outcome_time_s:.0f} s",
+        f"{row.outcome}, {row.outcome_time_s:.0f} s",
         f"{left:.2f}" if left < 100 else f"{left:.0f}",
         f"{row.w_sub_max_rad_s:.1e}",
         f"{row.roll_deg:.3f}  {row.pitch_deg:.3f}  {row.yaw_deg:.3f}",
@@ -96,11 +95,11 @@ def explain(row: Summary) -> str | None:
     x, y, z = row.final_position_m
     ended = {
         "stalled": f"stalled at {row.outcome_time_s:.1f} s",
-        "running": f"still moving when the time was over at {row.outcome_time_s:.1f} s",
+        "running": f"still running when the time was over at {row.outcome_time_s:.1f} s",
     }[row.outcome]
     damped = "" if row.law.endswith(UNDAMPED) else f", damped for {100 * row.damped_share:.0f} % of the time"
     return (
         f"{row.case}, {row.law}: {ended}, {1e3 * row.final_error_m:.0f} mm of {1e3 * row.start_distance_m:.0f} mm "
-        f"left, end-effector at ({x:.3f}, {y:.3f}, {z:.3f}) m. Smallest singular value of J_g N_sub "
+        f"left, end-effector at ({x:.3f}, {y:.3f}, {z:.3f}) m. Smallest singular value of J_gt N_sub "
         f"{row.sigma_min_m:.1e} m at {row.sigma_min_time_s:.1f} s{damped}."
     )
