@@ -33,6 +33,7 @@ def medians(candidates: dict[str, Callable[[], object]]) -> dict[str, float]:
     """Return the median time of one call of each candidate, s, measured in turns."""
     counts = {}
     for name, call in candidates.items():
+        call()  # may compile
         start, count = time.perf_counter(), 0
         while time.perf_counter() - start < ROUND_TIME:
             call()

@@ -51,7 +51,7 @@ _PROTECT = (
     "'0.5,0,0.866' or '1,0,0;0,0,1'; add '@inertial' for inertial axes."
 )
 Cases = Annotated[list[str], typer.Argument(help=_CASES, show_default=False)]
-Output = Annotated[Path, typer.Option("--output", "-o", help="Folder for motions, figures and tables.")]
+Output = Annotated[Path, typer.Option("--output", "-o", help="Folder for what is written.")]
 TimeStep = Annotated[float | None, typer.Option("--dt", help="Time between samples, s, instead of the case's own.")]
 Protect = Annotated[str | None, typer.Option("--protect", "-p", help=_PROTECT)]
 Damping = Annotated[

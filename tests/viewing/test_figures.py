@@ -79,7 +79,7 @@ def test_the_spacecraft_is_drawn_with_the_target_and_the_protected_axes(motion):
         np.testing.assert_allclose(target, motion.target_position.values[sample])
         x, y, z = np.array(axes.lines[0].get_data_3d())[:, -1]  # the arm's line ends at the end-effector
         np.testing.assert_allclose([x, y, z], motion.end_effector_position.values[sample], atol=1e-12)
-        axis = np.diff(np.array(labels["protected axis $U_c$"].get_data_3d()), axis=1)[:, 0]
+        axis = np.diff(np.array(labels["protected axes $U_c$"].get_data_3d()), axis=1)[:, 0]
         np.testing.assert_allclose(axis / np.linalg.norm(axis), [1, 0, 0], atol=0.01)
 
 

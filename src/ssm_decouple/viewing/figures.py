@@ -28,8 +28,12 @@ def joints(motion: xr.Dataset) -> Figure:
     sliding = _sliding_joints(motion)
     for i, (name, color) in enumerate(zip(motion.joint.values, joint_colors(motion.sizes["joint"]), strict=True)):
         unit = 1.0 if name in sliding else np.rad2deg(1.0)
-        top.plot(motion.time, unit * positions[:, i], color=color, label=str(name).replace("_", " "))
-        bottom.plot(motion.time, unit * rates[:, i], color=color)
+        style: dict[str, Any] = {
+            "color": color,
+            "linestyle": ("-", (0, (4, 1.2)))[i % 2],
+        }  # neighbours differ in more than shade
+        top.plot(motion.time, unit * positions[:, i], label=str(name).replace("_", " "), **style)
+        bottom.plot(motion.time, unit * rates[:, i], **style)
     top.set_ylabel("joint angle (deg)" if not sliding else "joint position (deg or m)")
     bottom.set_ylabel("joint rate (deg/s)" if not sliding else "joint rate (deg/s or m/s)")
     if motion.sizes["joint"] <= 12:
@@ -48,8 +52,8 @@ def base(motion: xr.Dataset) -> Figure:
         )
     top.set_ylabel("base attitude (deg)")
     bottom.set_ylabel("base angular velocity\n(mrad/s, base axes)")
-    top.legend(ncols=3)
-    bottom.legend(ncols=3)
+    _legend_above(top)
+    _legend_above(bottom)
     return _with_time(motion, figure, bottom)
 
 
@@ -64,9 +68,8 @@ def protected_rate(motion: xr.Dataset) -> Figure:
         axes.plot(
             motion.time,
             rates[:, i] / 10.0**exponent,
-            color=PROTECTED,
+            color=(PROTECTED, "#0072B2", "#E69F00")[i],
             linewidth=0.6,
-            linestyle=("-", "--", ":")[i],
             label=f"about ({column})",
         )
     if rates.shape[1]:
@@ -105,8 +108,11 @@ def comparison(motions: Mapping[str, xr.Dataset]) -> Figure:
     figure, axes = panels(2, 3, width=PAGE, height=1.95)
     distance, disturbed, singular, *angles = axes
     thresholds = set()
+    first = next(iter(motions.values()))
+    one = len(json.loads(first.attrs["case_U_c"])[0]) == 1
     for law, motion in motions.items():
-        line: dict[str, Any] = {**LAW_LINES.get(law, {}), "label": law}
+        # The law in question lies on top, where the others would hide it.
+        line: dict[str, Any] = {**LAW_LINES.get(law, {}), "label": law, "zorder": 3 if law == "selective" else 2}
         time = motion.time.values
         distance.semilogy(time, 1e3 * motion.end_effector_error, **line)
         rate = np.abs(disturbance(motion)[0]).max(axis=1, initial=0.0)
@@ -118,20 +124,28 @@ def comparison(motions: Mapping[str, xr.Dataset]) -> Figure:
     for threshold in thresholds:
         singular.axhline(threshold, color="black", linewidth=0.5, linestyle=":")
         singular.text(
-            0.99, threshold, "damped below", transform=singular.get_yaxis_transform(), ha="right", va="top", fontsize=6
+            0.98,
+            threshold,
+            f"damped below {threshold:g} m",
+            transform=singular.get_yaxis_transform(),
+            ha="right",
+            va="center",
+            fontsize=6,
+            bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.5},
         )
     distance.set(title="distance to target", ylabel="mm")
     disturbed.set(
-        title="rate about the protected axes", ylabel=r"$|\omega_\mathrm{sub}|$ (rad/s)", ylim=(FLOOR / 3, 1e-1)
+        title="rate about the protected axis" if one else "rate about the protected axes",
+        ylabel=r"$|\omega_\mathrm{sub}|$ (rad/s)",
+        ylim=(FLOOR / 3, 1e-1),
     )
-    singular.set(title=r"smallest singular value of $J_{g,t} N_\mathrm{sub}$", ylabel="m")
+    singular.set(title=r"smallest $\sigma$ of $J_{g,t} N_\mathrm{sub}$", ylabel="m")
     for axis, name in zip(angles, AXIS_COLORS, strict=True):
         axis.set(title=f"base {name}", ylabel="deg", xlabel="time (s)")
     low = min(axis.get_ylim()[0] for axis in angles)
     high = max(axis.get_ylim()[1] for axis in angles)
     for axis in angles:
         axis.set_ylim(low, high)
-    first = next(iter(motions.values()))
     figure.suptitle(first.attrs.get("title", first.attrs["robot"]), fontsize=9)
     figure.legend(*distance.get_legend_handles_labels(), ncols=len(motions), loc="outside lower center")
     distance.set_xlim(0, float(first.time[-1]))
@@ -182,6 +196,10 @@ def save_figures(motion: xr.Dataset, folder: str | Path, name: str) -> list[Path
         FileError: the folder cannot be made or written.
     """
     return [path for kind, draw in FIGURES.items() for path in save(draw(motion), folder, f"{name}_{kind}")]
+
+
+def _legend_above(axes: Axes) -> None:
+    axes.legend(ncols=3, loc="lower center", bbox_to_anchor=(0.5, 0.97))
 
 
 def _with_time(motion: xr.Dataset, figure: Figure, lowest: Axes) -> Figure:

@@ -36,6 +36,7 @@ def draw_configurations(motion: xr.Dataset) -> Figure:
         _draw_spacecraft(axes, robot, q, turned)
         _draw_motion(axes, motion, robot, q)
         axes.set_title(f"{label}, t = {float(motion.time[sample]):g} s", y=0.97)
+    figure.suptitle(motion.attrs.get("title", motion.attrs["robot"]), fontsize=9)
     handles, labels = axes.get_legend_handles_labels()
     figure.legend(handles, labels, ncols=len(labels), loc="outside lower center")
     return figure
@@ -78,7 +79,8 @@ def _draw_motion(axes: Axes3D, motion: xr.Dataset, robot: Robot, q: Floats) -> N
     if json.loads(motion.attrs["law"])["frame"] == "base":
         directions = pose.rotation @ directions
     for i, direction in enumerate(directions.T):
-        label = "protected axis $U_c$" if i == 0 else None
+        name = "protected axis $U_c$" if directions.shape[1] == 1 else "protected axes $U_c$"
+        label = name if i == 0 else None
         ends = pose.translation + np.outer([-2.3, 2.3], direction)
         axes.plot(*ends.T, color=PROTECTED, linewidth=1.6, label=label, zorder=4)
         axes.quiver(
@@ -89,12 +91,16 @@ def _draw_motion(axes: Axes3D, motion: xr.Dataset, robot: Robot, q: Floats) -> N
             arrow_length_ratio=0.6,
             zorder=4,
         )
+    corner = pose.translation + pose.rotation @ np.array([-2.0, -1.8, -1.6])
+    for axis, name in zip(pose.rotation.T, "xyz", strict=True):
+        axes.plot(*np.array([corner, corner + 0.9 * axis]).T, color="#555555", linewidth=0.9, zorder=4)
+        axes.text(*(corner + 1.15 * axis), name, fontsize=7, color="#555555", ha="center", va="center")
     centre = pose.translation + [-0.5, 0.0, 0.6]
     for set_limits, middle, half in zip(
-        (axes.set_xlim, axes.set_ylim, axes.set_zlim), centre, (2.4, 4.2, 2.0), strict=True
+        (axes.set_xlim, axes.set_ylim, axes.set_zlim), centre, (2.6, 8.2, 2.1), strict=True
     ):
         set_limits(middle - half, middle + half)
-    axes.set_box_aspect((2.4, 4.2, 2.0), zoom=1.35)
+    axes.set_box_aspect((2.6, 8.2, 2.1), zoom=1.52)
     axes.view_init(**_VIEW)
     axes.set_axis_off()
 
