@@ -595,6 +595,17 @@ def add_matrices(
     )
 
 
+@compiled_for("boolean(float64[::1], int64[::1])")
+def off_circle(q: Floats, starts: Floats) -> bool:
+    """Say whether a cosine and sine in q, at one of the given places, are not of unit length."""
+    for i in range(starts.shape[0]):
+        start = starts[i]
+        square = q[start] ** 2 + q[start + 1] ** 2
+        if not abs(square - 1.0) < 1e-6:
+            return True
+    return False
+
+
 @compiled
 def change_of(rates: Floats, before: Floats) -> float:
     """Return how far rates (n,) differ from those before, relative to the largest, and remember them there."""

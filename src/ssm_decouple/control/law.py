@@ -24,6 +24,9 @@ GAUSS: dict[int, tuple[tuple[float, float], ...]] = {
     2: ((0.5 - np.sqrt(3) / 6, 0.5), (0.5 + np.sqrt(3) / 6, 0.5)),
     3: ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 4 / 9), (0.5 + np.sqrt(15) / 10, 5 / 18)),
 }
+# One look-up instead of two, in every step.
+centroidal_map, selective_command = pin.computeCentroidalMap, kernel.selective_command
+
 PASSES = 12  # at most; away from singularities each gains a factor of about sample time x joint rate
 CONVERGED = 1e-13  # relative change of the rates from pass to pass
 
@@ -224,7 +227,10 @@ class SelectiveLaw:
         views = (data.Ag, data.J, placement.rotation, placement.translation)
         constants = (self.protection.U_c.copy(), columns, parameters)
         self._prepared = (model, data, views, constants, (*views, *constants))
-        self._continuous = any(joint.nq == 2 for joint in model.joints[2:])
+        # Where continuous joints keep cosine and sine: the matrices do not tell whether these fit.
+        circles = np.array([joint.idx_q for joint in model.joints[2:] if joint.nq == 2], dtype=np.int64)
+        self._circles = circles if circles.size else None
+        self._n, self._k = n, self.protection.k
         self._no_rates: Floats = np.zeros(n)
         self._J_base: Floats = np.zeros((6, n))
         self._matrices: Floats = np.zeros((kernel.MATRICES_SIZE, n))
@@ -254,7 +260,7 @@ class SelectiveLaw:
         """
         values = np.empty(self.size)
         self.evaluate(q, target, target_velocity, values, previous_rates)
-        return Command(values, self.robot.n_joints, self.protection.k)
+        return Command(values, self._n, self._k)
 
     def evaluate(
         self,
@@ -276,25 +282,25 @@ class SelectiveLaw:
         Raises:
             InputError: as for the call.
         """
-        if self._continuous:
-            q = self.robot.checked(q)  # the kernel sees matrices, not whether cosine and sine fit
         if previous_rates is None:
             if self.acceleration_limits is not None:
                 raise InputError("an acceleration limit needs previous_rates: those commanded before, zeros from rest")
             previous_rates = self._no_rates
         model, data, _, _, fixed = self._prepared
         try:  # arrays of the right kind are not looked at twice
-            pin.computeCentroidalMap(model, data, q)
-            status = kernel.selective_command(*fixed, target, target_velocity, previous_rates, out)  # type: ignore[arg-type]
+            if self._circles is not None and kernel.off_circle(q, self._circles):  # type: ignore[arg-type]
+                self.robot.checked(q)
+            centroidal_map(model, data, q)
+            status = selective_command(*fixed, target, target_velocity, previous_rates, out)  # type: ignore[arg-type]
         except (TypeError, ValueError):  # a list, another layout, a read-only array or a wrong length
             q = self.robot.checked(q)
             target, target_velocity = _vector("target", target), _vector("target_velocity", target_velocity)
             previous_rates = self._checked_rates(previous_rates)
             pin.computeCentroidalMap(model, data, q)
             status = kernel.selective_command(*fixed, target, target_velocity, previous_rates, self._checked_out(out))
-        if status == kernel.OK and self.hold_nodes:
+        if self.hold_nodes and status == kernel.OK:
             status = self._hold(q, np.asarray(target), np.asarray(target_velocity), np.asarray(previous_rates), out)
-        if status != kernel.OK:
+        if status:
             self._refuse(q, target, target_velocity, previous_rates, out, status)
 
     def base_twist(self, q: Floats, joint_rates: Floats) -> Floats:
