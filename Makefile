@@ -42,9 +42,10 @@ benchmarks: .venv/installed-bench
 clean:
 	rm -rf .venv .venv-wheel dist results
 
+# pip is renewed first: old resolvers try every version of everything.
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
-	$(BIN)/pip install --quiet --upgrade pip  # old resolvers try every version of everything
+	$(BIN)/pip install --quiet --upgrade pip
 
 .venv/installed: pyproject.toml .venv/bin/python
 	@echo "installing into .venv, a minute or so"
