@@ -14,13 +14,14 @@ import sys
 import tempfile
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 import ssm_decouple as ssm
-from ssm_decouple.studies.comparison import summarise
-from ssm_decouple.studies.sampling import sampling
+from ssm_decouple.studies.comparison import Summary, summarise
+from ssm_decouple.studies.sampling import Drift, sampling
 from ssm_decouple.viewing.figures import comparison, configuration
 from ssm_decouple.viewing.figures import sampling as draw_sampling
 from ssm_decouple.viewing.style import save
@@ -30,16 +31,31 @@ ROOT = Path(__file__).parents[1]
 DOCUMENTS = (ROOT / "README.md", ROOT / "docs" / "models.md", ROOT / "docs" / "limits.md")
 
 
+@cache
+def compared(name: str) -> ssm.Comparison:
+    """Return the comparison of a case, computed once for all tables and figures."""
+    return ssm.compare(ssm.load_case(name))
+
+
+@cache
+def drifts() -> list[Drift]:
+    """Return the drift of cases 1 to 3 under sampled laws, computed once for the table and the figure."""
+    return [row for i in (1, 2, 3) for row in sampling(ssm.load_case(f"case{i}"))]
+
+
+def summaries(suffix: str = "") -> list[Summary]:
+    """Return every row of the comparison of cases 1 to 3 on one of the two models."""
+    return [row for i in (1, 2, 3) for row in compared(f"case{i}{suffix}").summaries()]
+
+
 def cases_table(suffix: str) -> str:
-    """Return the comparison of cases 1 to 3 on one of the two models, with the reasons of what did not arrive."""
-    rows = [row for i in (1, 2, 3) for row in ssm.compare(ssm.load_case(f"case{i}{suffix}")).summaries()]
-    return markdown_table(rows)
+    """Return the comparison of cases 1 to 3 on one of the two models."""
+    return markdown_table(summaries(suffix))
 
 
 def stalls() -> str:
     """Return where and why reactionless control does not arrive in cases 1 to 3."""
-    rows = [row for i in (1, 2, 3) for row in ssm.compare(ssm.load_case(f"case{i}")).summaries()]
-    return "\n".join(f"- {reason}" for row in rows if (reason := explain(row)))
+    return "\n".join(f"- {reason}" for row in summaries() if (reason := explain(row)))
 
 
 def directions() -> str:
@@ -58,19 +74,19 @@ def directions() -> str:
 
 def patience() -> str:
     """Return how damped reactionless control ends when it has half an hour."""
-    lines = ["| case | outcome | left (mm) | turns of the wrist roll |", "|---|---|---:|---:|"]
+    lines = [["case", "outcome", "left (mm)", "turns of the wrist roll"]]
     for i in (1, 2, 3):
         case = replace(ssm.load_case(f"case{i}"), duration=1800.0)
         motion = case.run(ssm.Protection("all"))
         ended, when, left = (motion.attrs[key] for key in ("outcome", "outcome_time", "final_error"))
         turns = float(np.ptp(motion.joint_positions.values[:, -1])) / (2 * np.pi)
-        lines.append(f"| {case.name} | {ended} at {when:.0f} s | {1e3 * left:.0f} | {turns:.0f} |")
-    return "\n".join(lines)
+        lines.append([case.name, f"{ended} at {when:.0f} s", f"{1e3 * left:.0f}", f"{turns:.0f}"])
+    return markdown(lines)
 
 
 def drift() -> str:
     """Return how far the protected axis turns when commands are held, for each plan and sample time."""
-    return markdown(drift_table([row for i in (1, 2, 3) for row in sampling(ssm.load_case(f"case{i}"))]))
+    return markdown(drift_table(drifts()))
 
 
 def gentle() -> str:
@@ -123,10 +139,9 @@ def draw() -> None:
     folder = ROOT / "docs" / "images"
     folder.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
-        save(comparison(ssm.compare(ssm.load_case("case1")).motions), scratch, "case1_comparison")
-        save(configuration(ssm.load_case("case2").run()), scratch, "case2_configuration")
-        drifts = [row for i in (1, 2, 3) for row in sampling(ssm.load_case(f"case{i}"))]
-        save(draw_sampling(drifts), scratch, "sampling")
+        save(comparison(compared("case1").motions), scratch, "case1_comparison")
+        save(configuration(compared("case2").motions["selective"]), scratch, "case2_configuration")
+        save(draw_sampling(drifts()), scratch, "sampling")
         for path in Path(scratch).glob("*.png"):
             shutil.copy(path, folder / path.name)
 

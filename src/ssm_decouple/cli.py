@@ -169,7 +169,7 @@ def study_sampling(
     """
     from ssm_decouple.files import writable_folder
     from ssm_decouple.studies.comparison import write_csv
-    from ssm_decouple.studies.sampling import PLANS, Drift, sampling
+    from ssm_decouple.studies.sampling import PLANS, sampling
     from ssm_decouple.viewing import figures, style
     from ssm_decouple.viewing.table import drift_table, plain
 
@@ -181,9 +181,7 @@ def study_sampling(
 
         try:
             for case in _load(cases, None):
-                found: list[Drift] = []
-                found.extend(sampling(case, progress=partial(tick, case.name)))
-                rows += found
+                rows += list(sampling(case, progress=partial(tick, case.name)))
         except KeyboardInterrupt:
             interrupted = True
     files = [write_csv(rows, folder / "sampling.csv")] if rows else []

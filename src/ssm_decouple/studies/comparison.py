@@ -119,11 +119,11 @@ def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[An
     Under the case's own protection these are the motion's protected_rate and protected_angle; under another they say
     what the same directions suffer.
     """
-    from scipy.spatial.transform import Rotation
-
     U_c, frame = np.array(json.loads(motion.attrs["case_U_c"])).reshape(3, -1), motion.attrs["case_frame"]
     if np.array_equal(U_c, motion.U_c.values) and frame == json.loads(motion.attrs["law"])["frame"]:
         return motion.protected_rate.values, motion.protected_angle.values
+    from scipy.spatial.transform import Rotation
+
     omega, quaternions = motion.base_angular_velocity.values, motion.base_quaternion.values
     rate = (omega if frame == "base" else Rotation.from_quat(quaternions).apply(omega)) @ U_c
     return rate, rotation_about(U_c, frame, motion.base_rotation_integral.values, quaternions)

@@ -35,9 +35,7 @@ def cells(row: Summary) -> tuple[str, ...]:
 
 def terminal_table(rows: Sequence[Summary]) -> Table:
     """Return the comparison as a table for a terminal, a rule between cases."""
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in HEADINGS:
-        table.add_column(heading, justify="left" if heading in ("case", "law", "outcome") else "right", no_wrap=True)
+    table = _empty(HEADINGS, words=("case", "law", "outcome"))
     for i, row in enumerate(rows):
         last = i + 1 == len(rows) or rows[i + 1].case != row.case
         first = i == 0 or rows[i - 1].case != row.case
@@ -49,12 +47,7 @@ def terminal_table(rows: Sequence[Summary]) -> Table:
 
 def markdown_table(rows: Sequence[Summary]) -> str:
     """Return the comparison as a Markdown table."""
-    lines = [
-        f"| {' | '.join(HEADINGS).replace('|w_sub|', 'abs(w_sub)')} |",
-        "|---|---|" + "---:|" * (len(HEADINGS) - 2),
-    ]
-    lines += [f"| {' | '.join(cells(row))} |" for row in rows]
-    return "\n".join(lines)
+    return markdown([[heading.replace("|w_sub|", "abs(w_sub)") for heading in HEADINGS], *map(cells, rows)])
 
 
 def drift_table(rows: Sequence[Drift]) -> list[list[str]]:
@@ -80,11 +73,16 @@ def markdown(lines: Sequence[Sequence[str]]) -> str:
 def plain(lines: Sequence[Sequence[str]]) -> Table:
     """Return rows of texts, headings first, as a table for a terminal."""
     head, *body = lines
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for i, heading in enumerate(head):
-        table.add_column(heading, justify="left" if i < 2 else "right", no_wrap=True)
+    table = _empty(head, words=head[:2])
     for line in body:
         table.add_row(*line)
+    return table
+
+
+def _empty(headings: Sequence[str], words: Sequence[str]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for heading in headings:
+        table.add_column(heading, justify="left" if heading in words else "right", no_wrap=True)
     return table
 
 
