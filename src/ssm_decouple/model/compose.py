@@ -11,9 +11,10 @@ import pinocchio as pin
 from numpy.typing import ArrayLike
 
 from ssm_decouple.errors import ModelError, as_floats
-from ssm_decouple.model.catalogue import find_urdf
+from ssm_decouple.model.appendage import Appendage
+from ssm_decouple.model.catalogue import describe
 from ssm_decouple.model.robot import Robot, rigid_pose
-from ssm_decouple.model.urdf import parse_urdf, read_urdf, root_link, tip_links
+from ssm_decouple.model.urdf import parse_urdf, read_urdf, root_link, tip_links, triple
 
 
 def compose(
@@ -29,7 +30,8 @@ def compose(
     """Put an arm on a bus and return the whole as one robot.
 
     The two URDFs are merged into one, joined by a fixed joint, so that `robot.urdf` describes the whole and can be
-    saved and opened by any other tool. Composing again onto the result puts a second arm on the bus.
+    saved and opened by any other tool. Composing again onto the result puts a second arm on the bus. Flexible
+    appendages of the bus stay on it.
 
     Args:
         bus: The spacecraft: a catalogue name, a path or a robot, with or without arms of its own.
@@ -45,16 +47,22 @@ def compose(
         The composed robot.
 
     Raises:
-        ModelError: a part cannot be read, the mount link does not exist, names collide, or the whole is impossible.
+        ModelError: a part cannot be read, the mount link does not exist, names collide, the arm has flexible
+            appendages (they belong on the root link of the whole), or the whole is impossible.
         InputError: the mount is not a pose.
     """
-    (bus_text, bus_name), (arm_text, arm_name) = _text(bus), _text(arm)
+    (bus_text, bus_name, _, appendages), (arm_text, arm_name, known_tool, lost) = _parts(bus), _parts(arm)
+    if lost:
+        raise ModelError(
+            f"arm '{arm_name}' has the appendages {', '.join(wing.name for wing in lost)}, which would leave the root "
+            "link; give them to the whole with compose(..).with_appendages([..])"
+        )
     whole, part = parse_urdf(bus_text, bus_name), parse_urdf(arm_text, arm_name)
     carrier = mount_link or root_link(whole)
     links = [link.get("name") for link in whole.findall("link")]
     if carrier not in links:
         raise ModelError(f"bus '{bus_name}' has no link '{carrier}'; it has {', '.join(map(str, links))}")
-    tool = _tool(arm, part, arm_name, end_effector)
+    tool = _tool(part, arm_name, end_effector, known_tool)
     _rename(part, prefix)
     _refuse_collisions(whole, part, bus_name, arm_name, prefix)
     for child in part:
@@ -63,24 +71,30 @@ def compose(
     whole.append(_fixed_joint(carrier, root_link(part), _pose(mount)))
     whole.set("name", name or f"{bus_name}_{prefix}{arm_name}")
     ET.indent(whole)
-    return Robot(ET.tostring(whole, encoding="unicode"), name=whole.get("name", ""), end_effector=prefix + tool)
+    return Robot(
+        ET.tostring(whole, encoding="unicode"),
+        name=whole.get("name", ""),
+        end_effector=prefix + tool,
+        appendages=appendages,
+    )
 
 
-def _text(source: str | Path | Robot) -> tuple[str, str]:
+def _parts(source: str | Path | Robot) -> tuple[str, str, str | None, tuple[Appendage, ...]]:
+    """Return URDF text, name, end-effector where it is known, and appendages."""
     if isinstance(source, Robot):
-        return source.urdf, source.name
-    path = find_urdf(source)
-    return read_urdf(path), path.stem
+        return source.urdf, source.name, source.end_effector, source.appendages
+    found = describe(source)
+    return read_urdf(found.urdf), found.name, found.end_effector, found.appendages
 
 
-def _tool(arm: str | Path | Robot, part: ET.Element, arm_name: str, wanted: str | None) -> str:
+def _tool(part: ET.Element, arm_name: str, wanted: str | None, known: str | None) -> str:
     links = [link.get("name", "") for link in part.findall("link")]
     if wanted is not None:
         if wanted not in links:
             raise ModelError(f"arm '{arm_name}' has no link '{wanted}' for its end-effector; it has {', '.join(links)}")
         return wanted
-    if isinstance(arm, Robot):
-        return arm.end_effector
+    if known is not None:
+        return known
     tips = tip_links(part)
     if "end_effector" in links:
         return "end_effector"
@@ -122,8 +136,5 @@ def _fixed_joint(parent: str, child: str, pose: pin.SE3) -> ET.Element:
     joint = ET.Element("joint", name=f"{child}_mount", type="fixed")
     ET.SubElement(joint, "parent", link=parent)
     ET.SubElement(joint, "child", link=child)
-    xyz, rpy = (
-        " ".join(repr(float(x)) for x in vector) for vector in (pose.translation, pin.rpy.matrixToRpy(pose.rotation))
-    )
-    ET.SubElement(joint, "origin", xyz=xyz, rpy=rpy)
+    ET.SubElement(joint, "origin", xyz=triple(pose.translation), rpy=triple(pin.rpy.matrixToRpy(pose.rotation)))
     return joint

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ssm_decouple.errors import ModelError
+from ssm_decouple.errors import DecoupleError
+from ssm_decouple.model.appendage import inspect_remaining_bus, remaining_bus
 from ssm_decouple.model.urdf import Finding, inspect_urdf, parse_urdf, read_urdf, root_link, tip_links
 
 if TYPE_CHECKING:
@@ -29,6 +30,70 @@ class JointReport:
 
 
 @dataclass(frozen=True)
+class AppendageReport:
+    """One flexible appendage: its mass (kg), size (m), segments and frequencies (Hz) with the base held."""
+
+    name: str
+    mass: float
+    span: float
+    chord: float
+    segments: int
+    frequencies: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class FlexibleReport:
+    """What bends.
+
+    Attributes:
+        appendages: One entry an appendage.
+        frequencies: Of all of them together on the floating base, joints held at zero, Hz, rising.
+        bus_mass: What the root link weighs without them, kg.
+        bus_inertia: Its principal moments (3,) about its own centre of mass, kg m2.
+    """
+
+    appendages: tuple[AppendageReport, ...]
+    frequencies: tuple[float, ...]
+    bus_mass: float
+    bus_inertia: tuple[float, ...]
+
+    @classmethod
+    def of_robot(cls, robot: Robot) -> FlexibleReport:
+        """Report on the appendages of a robot that has some."""
+        from ssm_decouple.model.plant import Plant
+
+        bus = remaining_bus(parse_urdf(robot.urdf, robot.name), robot.appendages)
+        return cls(
+            appendages=tuple(
+                AppendageReport(a.name, a.mass, a.span, a.chord, a.segments, tuple(a.frequencies.tolist()))
+                for a in robot.appendages
+            ),
+            frequencies=tuple(Plant.of(robot).frequencies().tolist()),
+            bus_mass=bus.mass,
+            bus_inertia=tuple(np.linalg.eigvalsh(bus.inertia).tolist()),
+        )
+
+    def lines(self) -> list[str]:
+        """Return the lines that a printed report has of it."""
+        moments = ", ".join(f"{moment:.5g}" for moment in self.bus_inertia)
+        width = max(len(appendage.name) for appendage in self.appendages)
+        lines = [f"  appendages    {len(self.appendages)}, bending out of plane"]
+        for a in self.appendages:
+            cut = "1 segment" if a.segments == 1 else f"{a.segments} segments"
+            size = f"{a.mass:8.4g} kg  {a.span:.4g} x {a.chord:.4g} m  {cut}"
+            lines.append(f"    {a.name:<{width}}  {size}  base held {_hertz(a.frequencies)}")
+        return [
+            *lines,
+            f"  free-flying   {_hertz(self.frequencies)}, joints held at zero",
+            f"  bus remains   {self.bus_mass:.6g} kg, principal moments {moments} kg m2",
+        ]
+
+
+def _hertz(frequencies: tuple[float, ...]) -> str:
+    return ", ".join(f"{frequency:.4g}" for frequency in frequencies) + " Hz"
+
+
+@dataclass(frozen=True)
 class Report:
     """What a robot is made of, and what is suspicious or impossible in its description.
 
@@ -45,6 +110,7 @@ class Report:
         frames: Every link, in Pinocchio's order; each can be an end-effector.
         joints: One entry a joint, in the order of the joint rates.
         findings: All that is impossible, suspicious or worth a note.
+        flexible: Its appendages and what they leave of the bus; None where it has none.
     """
 
     name: str
@@ -59,6 +125,7 @@ class Report:
     frames: tuple[str, ...]
     joints: tuple[JointReport, ...]
     findings: tuple[Finding, ...]
+    flexible: FlexibleReport | None = None
 
     @classmethod
     def of_robot(cls, robot: Robot) -> Report:
@@ -67,23 +134,26 @@ class Report:
 
     @classmethod
     def of_file(cls, path: str | Path) -> Report:
-        """Report on a URDF file, whether or not it can be loaded.
+        """Report on a URDF file, or a TOML file that adds appendages to one, whether or not it can be loaded.
 
         Raises:
-            ModelError: the file cannot be read, is not XML or not a URDF.
+            ModelError: the file cannot be read, is not XML or not a URDF; a TOML file is no robot.
         """
+        from ssm_decouple.model.catalogue import describe
         from ssm_decouple.model.robot import Robot
 
-        text, name = read_urdf(path), Path(path).stem
-        root = parse_urdf(text, str(path))
+        described = describe(path)
+        text, name = read_urdf(described.urdf), described.name
+        root = parse_urdf(text, str(described.urdf))
         findings = inspect_urdf(root)
         if any(finding.level == "impossible" for finding in findings):
             return cls._unusable(name, findings)
         tips = tip_links(root)
-        ambiguous = len(tips) > 1 and "end_effector" not in tips
+        ambiguous = described.end_effector is None and len(tips) > 1 and "end_effector" not in tips
+        tool = tips[0] if ambiguous else described.end_effector
         try:
-            robot = Robot(text, name=name, end_effector=tips[0] if ambiguous else None)
-        except ModelError as error:
+            robot = Robot(text, name=name, end_effector=tool, appendages=described.appendages)
+        except DecoupleError as error:
             return cls._unusable(name, [*findings, Finding("impossible", "robot", str(error))])
         return cls._of_loaded(robot, None if ambiguous else robot.end_effector)
 
@@ -116,7 +186,8 @@ class Report:
             tips=tuple(tip_links(root)),
             frames=tuple(robot.link_names),
             joints=tuple(joints),
-            findings=tuple(inspect_urdf(root)),
+            findings=(*inspect_urdf(root), *inspect_remaining_bus(root, robot.appendages)),
+            flexible=FlexibleReport.of_robot(robot) if robot.appendages else None,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -152,6 +223,8 @@ class Report:
                     f"    {joint.name:<{width}}  {joint.type:<10}  {joint.mass:8.4g} kg  {_limits(joint):<22}  "
                     f"{_quantity(joint.rate_limit, joint.type, '/s')}"
                 )
+        if self.flexible is not None:
+            lines += self.flexible.lines()
         for level in ("impossible", "suspicious", "note"):
             lines += [f"  {level:<10}  {finding}" for finding in self.findings if finding.level == level]
         if not any(finding.level != "note" for finding in self.findings):

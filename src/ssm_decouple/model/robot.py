@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, as_floats
+from ssm_decouple.model.appendage import Appendage, Modes, checked_appendages, inspect_remaining_bus
 from ssm_decouple.model.urdf import inspect_urdf, parse_urdf, root_link, tip_links
 
 if TYPE_CHECKING:
@@ -34,6 +36,8 @@ class Robot:
         name: What the robot is called in messages and results.
         end_effector: The link or frame that the tasks move. None takes the link called "end_effector", else the only
             tip of the arm.
+        appendages: Solar wings and the like, on the root link, whose mass and inertia the URDF's root link already
+            holds. The robot itself stays rigid; `Plant.of(robot)` is the one that bends.
 
     Attributes:
         urdf: The URDF text.
@@ -47,12 +51,17 @@ class Robot:
         rate_limits: Joint rate limits (n,) from the URDF, rad/s or m/s; inf where it gives none.
         position_limits: Lower and upper joint limits (n, 2), rad or m; infinite for continuous joints.
         mass: Total mass, kg.
+        appendages: As given, a tuple.
 
     Raises:
-        ModelError: the text is no URDF, cannot be simulated, or the end-effector does not exist or is ambiguous.
+        ModelError: the text is no URDF, cannot be simulated, or the end-effector does not exist or is ambiguous; or an
+            appendage outweighs the root link, leaves it no possible inertia or shares a name with the URDF.
+        InputError: two appendages share a name.
     """
 
-    def __init__(self, urdf: str, *, name: str, end_effector: str | None = None) -> None:
+    def __init__(
+        self, urdf: str, *, name: str, end_effector: str | None = None, appendages: Iterable[Appendage] = ()
+    ) -> None:
         root = parse_urdf(urdf, name)
         findings = inspect_urdf(root)
         impossible = [finding for finding in findings if finding.level == "impossible"]
@@ -83,6 +92,49 @@ class Robot:
         self.rate_limits: Floats = np.where((rates > 0) & (rates < UNLIMITED), rates, np.inf)
         self.position_limits: Floats = self._read_position_limits()
         self._refuse_singular_inertia()
+        self.appendages: tuple[Appendage, ...] = self._fitting(appendages)
+
+    def with_appendages(self, appendages: Iterable[Appendage]) -> Robot:
+        """Return this robot with these appendages on its root link, instead of any that it has.
+
+        Args:
+            appendages: Their mass and inertia are part of the root link's already: the whole at rest does not change.
+
+        Raises:
+            ModelError: one outweighs the root link, leaves it no possible inertia or shares a name with the URDF.
+            InputError: two share a name.
+        """
+        robot = copy.copy(self)
+        robot._data = self.model.createData()  # the model is shared, what is computed on it is not
+        robot.appendages = robot._fitting(appendages)
+        return robot
+
+    def _fitting(self, appendages: Iterable[Appendage]) -> tuple[Appendage, ...]:
+        try:
+            found = checked_appendages(appendages)
+            strange = inspect_remaining_bus(parse_urdf(self.urdf, self.name), found)
+        except (InputError, ModelError) as error:
+            raise type(error)(f"robot '{self.name}': {error}") from error
+        for finding in strange:
+            message = f"robot '{self.name}': no solid body has such an inertia: {finding}"
+            warnings.warn(message, DecoupleWarning, stacklevel=3)
+        return found
+
+    def modes(self, per_appendage: int = 1) -> Modes:
+        """Return the clamped bending modes of the appendages: frequencies, shapes and how the base drives them.
+
+        Args:
+            per_appendage: How many of each appendage, the lowest first.
+
+        Raises:
+            InputError: no appendage, fewer than one mode, or more than an appendage has segments.
+        """
+        if not self.appendages:
+            raise InputError(
+                f"'{self.name}' has no appendage and so no modes; give it some with robot.with_appendages([..]), or "
+                "load a TOML robot such as 'ets_vii_flexible'"
+            )
+        return Modes.of(self.appendages, per_appendage)
 
     def _choose_end_effector(self, wanted: str | None, tips: list[str], root: str) -> str:
         frames = self.link_names
@@ -134,7 +186,10 @@ class Robot:
             )
 
     def __repr__(self) -> str:
-        return f"Robot({self.name!r}, {self.n_joints} joints, {self.mass:g} kg, end_effector={self.end_effector!r})"
+        wings = f", {len(self.appendages)} appendages" if self.appendages else ""
+        return (
+            f"Robot({self.name!r}, {self.n_joints} joints{wings}, {self.mass:g} kg, end_effector={self.end_effector!r})"
+        )
 
     def configuration(
         self, joints: ArrayLike | Mapping[str, float] | None = None, base_pose: pin.SE3 | ArrayLike | None = None

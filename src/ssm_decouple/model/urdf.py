@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.errors import ModelError
@@ -231,6 +233,63 @@ def _attribute(element: ET.Element, child: str, name: str) -> float:
 def _inertia_matrix(inertial: ET.Element) -> NDArray[np.float64]:
     xx, xy, xz, yy, yz, zz = (_attribute(inertial, "inertia", f"i{ij}") for ij in ("xx", "xy", "xz", "yy", "yz", "zz"))
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+
+
+@dataclass(frozen=True)
+class Body:
+    """What a rigid body weighs, in the axes of its link.
+
+    Attributes:
+        mass: kg.
+        centre: Centre of mass (3,), m.
+        inertia: About the centre of mass (3, 3), kg m2.
+    """
+
+    mass: float
+    centre: NDArray[np.float64]
+    inertia: NDArray[np.float64]
+
+    def without(self, parts: Iterable[Body]) -> Body:
+        """Return what remains of the body when parts of it, given in the same axes, are taken out."""
+        parts = list(parts)
+        mass = self.mass - sum(part.mass for part in parts)
+        moment = self.mass * self.centre - sum((part.mass * part.centre for part in parts), np.zeros(3))
+        centre = moment / mass
+        inertia = self._about(centre) - sum((part._about(centre) for part in parts), np.zeros((3, 3)))
+        return Body(mass, centre, inertia)
+
+    def _about(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
+        arm = self.centre - point
+        return self.inertia + self.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+
+
+def read_body(link: ET.Element) -> Body:
+    """Return the mass, the centre of mass and the inertia of a link, in its axes; zero where it has no <inertial>."""
+    inertial = link.find("inertial")
+    if inertial is None:
+        return Body(0.0, np.zeros(3), np.zeros((3, 3)))
+    origin = inertial.find("origin")
+    place = {} if origin is None else origin.attrib
+    xyz, rpy = (floats(place.get(key), (0.0, 0.0, 0.0)) for key in ("xyz", "rpy"))
+    turned = pin.rpy.rpyToMatrix(*rpy)
+    return Body(_attribute(inertial, "mass", "value"), xyz, turned @ _inertia_matrix(inertial) @ turned.T)
+
+
+def write_body(link: ET.Element, body: Body) -> None:
+    """Give a link this mass, centre of mass and inertia, instead of any that it has."""
+    for old in link.findall("inertial"):
+        link.remove(old)
+    inertial = ET.Element("inertial")
+    ET.SubElement(inertial, "origin", xyz=triple(body.centre), rpy="0 0 0")
+    ET.SubElement(inertial, "mass", value=repr(float(body.mass)))
+    tensor = {f"i{'xyz'[i]}{'xyz'[j]}": repr(float(body.inertia[i, j])) for i in range(3) for j in range(i, 3)}
+    ET.SubElement(inertial, "inertia", tensor)
+    link.insert(0, inertial)
+
+
+def triple(vector: NDArray[np.float64]) -> str:
+    """Write three numbers as a URDF attribute that loses no digit."""
+    return " ".join(repr(float(x)) for x in vector)
 
 
 def root_link(root: ET.Element) -> str:
