@@ -80,9 +80,9 @@ def test_held_steps_are_of_sixth_order(ets_vii, rng):
     values = np.r_[np.zeros(6), rates]
 
     def after(steps):
-        q, turned = q0, np.zeros(3)
+        q, turned = q0, np.zeros(6)
         for i in range(steps):
-            q, more = held(law, None, q, values, 2.0 * i / steps, 2.0 * (i + 1) / steps)
+            q, more = held(law, None, None, q, values, 2.0 * i / steps, 2.0 * (i + 1) / steps)
             turned = turned + more
         return q, turned
 
@@ -227,7 +227,7 @@ def test_bad_use_is_refused(ets_vii):
         ssm.simulate(planned, q, TARGET, 1.0, 0.2, method="held")
     with pytest.raises(ssm.InputError, match=r"duration 1.05 s is no whole number of steps of 0.1 s"):
         ssm.simulate(planned, q, TARGET, 1.05, 0.1, method="held")
-    with pytest.raises(ssm.InputError, match="use method 'held', not 'explicit'"):
+    with pytest.raises(ssm.InputError, match="use method 'held' or a Dynamic, not 'explicit'"):
         ssm.simulate(planned, q, TARGET, 1.0, 0.1)
     with pytest.raises(ssm.InputError, match="not 'rk4'"):
         ssm.simulate(limited, q, TARGET, 1.0, 0.1, method="rk4")

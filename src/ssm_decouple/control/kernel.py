@@ -59,16 +59,16 @@ WRONG_SIZE = 4
 
 # Where the results stand in `out`: first Pinocchio's velocity v, base twist (6: linear, angular, base axes) and joint
 # rates (n), then the following, counted from 6 + n.
-PROTECTED_RATE = 0  # 3, the first k used
-POSITION = 3  # 3: end-effector, inertial axes
-ERROR = 6  # 3: target minus end-effector, inertial axes
-SMALLEST_SINGULAR_VALUE = 9  # of J_gt N_sub
-RATE_SCALE = 10
-DAMPING = 11  # rho
-RANK = 12  # of J_sub
-RATE_BLEND = 13  # 1, or less where acceleration limits held the rates back
-PLAN_CHANGE = 14  # relative change of the rates in the last pass of planning for a hold; 0 without a plan
-RESULTS_SIZE = 15
+PROTECTED_RATE = 0  # 6, the first k used
+POSITION = 6  # 3: end-effector, inertial axes
+ERROR = 9  # 3: target minus end-effector, inertial axes
+SMALLEST_SINGULAR_VALUE = 12  # of J_gt N_sub
+RATE_SCALE = 13
+DAMPING = 14  # rho
+RANK = 15  # of J_sub
+RATE_BLEND = 16  # 1, or less where acceleration limits held the rates back
+PLAN_CHANGE = 17  # relative change of the rates in the last pass of planning for a hold; 0 without a plan
+RESULTS_SIZE = 18
 
 # Where the scalars stand in `parameters`.
 GAIN = 0
@@ -78,7 +78,9 @@ MASS = 3
 LIMITS_STEPS = 4  # 1.0 if RATE_STEP limits anything
 INERTIAL = 5  # 1.0 if U_c is fixed in inertial axes, 0.0 in base axes
 TOOL = 6  # 3: the end-effector in its joint's frame
-PARAMETERS_SIZE = 9
+PACE = 9  # in [0, 1]
+WANTED_RATE = 10  # 6, the first k used: b, what J_sub q_dot shall be
+PARAMETERS_SIZE = 16
 
 # The rows of `columns`: one entry a joint.
 MOVES_TOOL = 0  # 1.0 where the joint carries the end-effector, else 0.0
@@ -87,13 +89,16 @@ RATE_STEP = 2  # largest change of the rate from one command to the next; infini
 
 # The rows of `matrices`, one column a joint.
 J_BASE = 0  # 6: base twist per joint rate, base axes
-J_PROTECTED = 6  # 3: base angular velocity per joint rate, in the axes in which U_c is fixed
-J_TASK = 9  # 3: translational generalized Jacobian, inertial axes
-MATRICES_SIZE = 12
-WORK_SIZE = MATRICES_SIZE + 9 + 12  # rows of scratch that one command needs
+J_TASK = 6  # 3: translational generalized Jacobian, inertial axes
+J_PROTECTED = 9  # 6: base twist per joint rate, inertial axes; filled only where U_c is fixed in these
+MATRICES_SIZE = 15
+SOLVE_ROWS = 2 * 6 + 7  # rows of scratch that `solve` needs
+WORK_SIZE = MATRICES_SIZE + 9 + SOLVE_ROWS  # and that a whole command needs
+SMALL = 9  # length of the rows of small scratch: k + 3
 
 EPS = 2.220446049250313e-16
 # A row of J_sub below this many rounding errors of J_rc, a metre from the inertial origin, constrains nothing: noise.
+# Of J_base where U_c has linear rows: the velocity of the base origin rounds as J_rc times some metres.
 NOISE = 16.0 * EPS
 # Rates are scaled to just inside the limit, so that no later rounding lifts one above it.
 INSIDE = 1.0 - 8.0 * EPS
@@ -231,19 +236,24 @@ def orthogonalise_columns(B: Floats, V: Floats) -> float:
 
 
 @compiled
-def scale_to_limits(q_dot: Floats, columns: Floats) -> float:
-    """Scale q_dot (n,) as a whole, in place, to inside every joint's limit; return the factor, 1 if it was inside.
+def bring_within_limits(fixed: Floats, q_dot: Floats, columns: Floats, pace: float) -> float:
+    """Scale what q_dot (n,) has beyond `fixed` (n,) to inside every joint's limit, in place; return the factor.
 
-    Clipping joint by joint would leave null(J_sub).
+    It is scaled as a whole, 1 if it was inside: clipping joint by joint would leave null(J_sub). `fixed` must be within
+    the limits itself. Their pace applies to what is left beside it.
     """
     factor = 1.0
     for j in range(q_dot.shape[0]):
-        size = abs(q_dot[j])
-        if size * factor > columns[RATE_LIMIT, j]:
-            factor = INSIDE * columns[RATE_LIMIT, j] / size
+        way = q_dot[j] - fixed[j]
+        # Not a number for an infinite limit at pace 0: then it limits nothing, and nothing moves.
+        limit = pace * columns[RATE_LIMIT, j] + (1.0 - pace) * abs(fixed[j])
+        if abs(fixed[j] + factor * way) > limit:
+            toward = fixed[j] if way > 0.0 else -fixed[j]
+            factor = min(factor, (INSIDE * limit - toward) / abs(way))
+    factor = max(factor, 0.0)
     if factor < 1.0:
         for j in range(q_dot.shape[0]):
-            q_dot[j] *= factor
+            q_dot[j] = fixed[j] + factor * (q_dot[j] - fixed[j])
     return factor
 
 
@@ -280,20 +290,17 @@ def add_matrices_at(
         position[r] += weight * p[r]
     point_velocity_map(J, p, J_base, columns, small[0:3], J_g)
     for j in range(n):
-        x, y, z = J_base[3, j], J_base[4, j], J_base[5, j]
-        if parameters[INERTIAL] > 0.0:
-            x, y, z = (
-                (A_g[0, 0] * x + A_g[0, 1] * y + A_g[0, 2] * z) / mass,
-                (A_g[1, 0] * x + A_g[1, 1] * y + A_g[1, 2] * z) / mass,
-                (A_g[2, 0] * x + A_g[2, 1] * y + A_g[2, 2] * z) / mass,
-            )
-        matrices[J_PROTECTED, j] += weight * x
-        matrices[J_PROTECTED + 1, j] += weight * y
-        matrices[J_PROTECTED + 2, j] += weight * z
         for b in range(6):
             matrices[J_BASE + b, j] += weight * J_base[b, j]
         for r in range(3):
             matrices[J_TASK + r, j] += weight * J_g[r, j]
+    if parameters[INERTIAL] > 0.0:
+        for j in range(n):
+            for b in range(0, 6, 3):
+                x, y, z = J_base[b, j], J_base[b + 1, j], J_base[b + 2, j]
+                for r in range(3):
+                    turned = (A_g[r, 0] * x + A_g[r, 1] * y + A_g[r, 2] * z) / mass
+                    matrices[J_PROTECTED + b + r, j] += weight * turned
     return OK
 
 
@@ -370,13 +377,24 @@ def damped_solution(L: Floats, V: Floats, v: Floats, free: int, parameters: Floa
 
 @compiled
 def take_out_leak(
-    J_sub: Floats, rows: Floats, weights: Floats, diagonal: Floats, order: Floats, rank: int, leak: Floats, x: Floats
+    J_sub: Floats,
+    rows: Floats,
+    weights: Floats,
+    diagonal: Floats,
+    order: Floats,
+    rank: int,
+    wanted: Floats,
+    leak: Floats,
+    x: Floats,
 ) -> None:
-    """Project x (n,) on null(J_sub) in place, x -= J_sub^+ J_sub x, by the reflections that factored J_sub."""
+    """Bring x (n,) to J_sub x = wanted in place, x -= J_sub^+ (J_sub x - wanted), by what factored J_sub.
+
+    From x = 0 this is the solution of minimum norm. Only the first `rank` rows in order are looked at.
+    """
     n = x.shape[0]
     leak[:] = 0.0
     for i in range(rank):
-        residual = 0.0
+        residual = -wanted[int(order[i])]
         for j in range(n):
             residual += J_sub[int(order[i]), j] * x[j]
         for s in range(i):
@@ -386,6 +404,66 @@ def take_out_leak(
         apply_reflection(rows, weights, i, i, leak)
     for j in range(n):
         x[j] -= leak[j]
+
+
+@compiled
+def nearest_attainable(rows: Floats, diagonal: Floats, order: Floats, k: int, rank: int, wanted: Floats) -> None:
+    """Replace `wanted` (6,) by the nearest vector in the range of J_sub, of k rows and a smaller rank, in place.
+
+    In their order the factored rows are [L1; L2], L1 lower triangular. Plane rotations from the left, from the last
+    column to the first, put L2 to zero and leave a triangular system for the coordinates of the nearest vector.
+    """
+    work, y = np.empty((k, rank + 1)), np.empty(rank)  # b and, behind it, [L1; L2]
+    for i in range(k):
+        work[i, 0] = wanted[int(order[i])]
+        for s in range(rank):
+            work[i, 1 + s] = rows[i, s] if s < i else (diagonal[i] if s == i else 0.0)
+    for c in range(rank - 1, -1, -1):
+        for i in range(rank, k):
+            length = np.sqrt(work[c, 1 + c] ** 2 + work[i, 1 + c] ** 2)
+            cosine, sine = work[c, 1 + c] / length, work[i, 1 + c] / length
+            for s in range(c + 2):
+                upper, lower = work[c, s], work[i, s]
+                work[c, s], work[i, s] = cosine * upper + sine * lower, cosine * lower - sine * upper
+    for i in range(rank):
+        y[i] = work[i, 0]
+        for s in range(i):
+            y[i] -= work[i, 1 + s] * y[s]
+        y[i] /= work[i, 1 + i]
+    for i in range(k):
+        value = 0.0
+        for s in range(min(i + 1, rank)):
+            value += (rows[i, s] if s < i else diagonal[i]) * y[s]
+        wanted[int(order[i])] = value
+
+
+@compiled
+def fixed_part(
+    J_sub: Floats,
+    rows: Floats,
+    weights: Floats,
+    diagonal: Floats,
+    order: Floats,
+    rank: int,
+    columns: Floats,
+    wanted: Floats,
+    leak: Floats,
+    q_dot: Floats,
+) -> None:
+    """Make q_dot (n,), zero on entry, the J_sub^+ b of minimum norm, and `wanted` (6,), b on entry, what it reaches.
+
+    b gives way where J_sub has not the rank for it, to the nearest that there is, and where the rates would exceed
+    their limits, as a whole.
+    """
+    k = J_sub.shape[0]
+    if rank < k:
+        nearest_attainable(rows, diagonal, order, k, rank, wanted)
+    for _ in range(2):  # the second time takes out the rounding of the first
+        take_out_leak(J_sub, rows, weights, diagonal, order, rank, wanted, leak, q_dot)
+    leak[:] = 0.0
+    factor = bring_within_limits(leak, q_dot, columns, 1.0)
+    for i in range(k):
+        wanted[i] *= factor
 
 
 @compiled
@@ -419,27 +497,40 @@ def solve(
 ) -> int:
     """Write the command that the matrices give into `out`; return OK or NOT_FINITE.
 
-    The end-effector's position stands in `out` already. `scratch` (12, n) and `small` (10, 6) are overwritten.
+    The end-effector's position stands in `out` already. `scratch` (SOLVE_ROWS, n) and `small` (11, SMALL) are
+    overwritten.
 
     One Householder factorisation of [J_sub; J_g]^T carries the whole law. With Q its reflections in order, J_sub is
     lower triangular in the first r = rank(J_sub) coordinates of Q^T q_dot, so a rate that is zero in those lies in
     null(J_sub) whatever the others are. In the next three coordinates J_g is the lower triangular L (3, 3), whose
     singular values are those of J_gt N_sub, and min |L y - v_cmd|^2 + rho |y|^2 is the paper's objective.
+
+    Where J_sub q_dot = b is asked for, all that stands beside a fixed part J_sub^+ b, which the task takes as given.
     """
-    n, k = columns.shape[1], U_c.shape[1]
+    n, k, pace = columns.shape[1], U_c.shape[1], parameters[PACE]
     results = out[6 + n :]
     J_sub, rows, q_dot = scratch[0:k], scratch[k : 2 * k + 3], scratch[2 * k + 3]
-    leak, slow = scratch[2 * k + 4], scratch[2 * k + 5]
-    L, V, weights, diagonal, v, order = small[0:3], small[3:6], small[6], small[7], small[8], small[9]
+    leak, slow, fixed = scratch[2 * k + 4], scratch[2 * k + 5], scratch[2 * k + 6]
+    L, V, weights = small[0:3], small[3:6], small[6]
+    diagonal, v, order, wanted = small[7], small[8], small[9], small[10]
+    first, asked = 3, False
     for i in range(k):
         order[i] = i
+        wanted[i] = parameters[WANTED_RATE + i]
+        asked = asked or wanted[i] != 0.0
+        if U_c[0, i] != 0.0 or U_c[1, i] != 0.0 or U_c[2, i] != 0.0:
+            first = 0
 
+    source = J_PROTECTED if parameters[INERTIAL] > 0.0 else J_BASE
     scale = 0.0
     for j in range(n):
-        x, y, z = matrices[J_PROTECTED, j], matrices[J_PROTECTED + 1, j], matrices[J_PROTECTED + 2, j]
-        scale += x * x + y * y + z * z
+        fixed[j], q_dot[j] = 0.0, 0.0
+        for b in range(first, 6):
+            scale += matrices[source + b, j] ** 2
         for i in range(k):
-            J_sub[i, j] = U_c[0, i] * x + U_c[1, i] * y + U_c[2, i] * z
+            J_sub[i, j] = 0.0
+            for b in range(first, 6):
+                J_sub[i, j] += U_c[b, i] * matrices[source + b, j]
             rows[i, j] = J_sub[i, j]
         for r in range(3):
             rows[k + r, j] = matrices[J_TASK + r, j]
@@ -450,30 +541,37 @@ def solve(
 
     for r in range(3):
         results[ERROR + r] = target[r] - results[POSITION + r]
-        v[r] = target_velocity[r] + parameters[GAIN] * results[ERROR + r]
-    q_dot[:] = 0.0
+        v[r] = pace * (target_velocity[r] + parameters[GAIN] * results[ERROR + r])
+    if asked:
+        fixed_part(J_sub, rows, weights, diagonal, order, rank, columns, wanted, leak, fixed)
+        for r in range(3):
+            for j in range(n):
+                v[r] -= matrices[J_TASK + r, j] * fixed[j]
     damped_solution(L, V, v, free, parameters, results, q_dot[rank:])
     for t in range(free - 1, -1, -1):
         apply_reflection(rows, weights, k + t, rank + t, q_dot)
     for i in range(rank - 1, -1, -1):
         apply_reflection(rows, weights, i, i, q_dot)
+    if asked:
+        for j in range(n):
+            q_dot[j] += fixed[j]
 
-    rate_scale = scale_to_limits(q_dot, columns)
+    rate_scale = bring_within_limits(fixed, q_dot, columns, pace)
     blend = 1.0
     if parameters[LIMITS_STEPS] > 0.0:
-        # Blend from the previous rates, brought into today's null space, to the wanted ones: the line between the two
-        # lies in that null space. From rest this is time scaling.
+        # Blend from the previous rates, brought to today's J_sub q_dot = b, to the wanted ones: so is all the line
+        # between the two. From rest, with b = 0, this is time scaling.
         for j in range(n):
             slow[j] = previous[j]
-        take_out_leak(J_sub, rows, weights, diagonal, order, rank, leak, slow)
-        scale_to_limits(slow, columns)
+        take_out_leak(J_sub, rows, weights, diagonal, order, rank, wanted, leak, slow)
+        bring_within_limits(fixed, slow, columns, pace)
         blend = largest_blend(slow, q_dot, previous, columns)
         for j in range(n):
             q_dot[j] = slow[j] + blend * (q_dot[j] - slow[j])
     if rank > 0:  # what rounding has left in the protected rows
-        take_out_leak(J_sub, rows, weights, diagonal, order, rank, leak, q_dot)
+        take_out_leak(J_sub, rows, weights, diagonal, order, rank, wanted, leak, q_dot)
         # Where J_sub is ill-conditioned the correction can lift a rate above its limit by more than rounding.
-        rate_scale *= scale_to_limits(q_dot, columns)
+        rate_scale *= bring_within_limits(fixed, q_dot, columns, pace)
 
     total = v[0] + v[1] + v[2]
     for j in range(n):
@@ -483,7 +581,7 @@ def solve(
         out[b] = 0.0
         for j in range(n):
             out[b] += matrices[J_BASE + b, j] * q_dot[j]
-    for i in range(3):
+    for i in range(6):
         results[PROTECTED_RATE + i] = 0.0
         if i < k:
             for j in range(n):
@@ -523,7 +621,8 @@ def selective_command(
         J: Joint Jacobians at the world origin (6, 6 + n), `pin.Data.J` after the same call.
         joint_rotation: Rotation (3, 3) of the joint that holds the end-effector, joint to inertial.
         joint_translation: Its position (3,), m, inertial axes.
-        U_c: Protected directions (3, k), orthonormal columns, base or inertial axes as `parameters` says.
+        U_c: Protected directions of the base twist (6, k), orthonormal columns, base or inertial axes as `parameters`
+            says.
         columns: (3, n), MOVES_TOOL, RATE_LIMIT and RATE_STEP for each joint.
         parameters: (PARAMETERS_SIZE,), by the indices above.
         target: Desired end-effector position (3,), m, inertial axes.
@@ -539,7 +638,7 @@ def selective_command(
     if wrong_size(n, target, target_velocity, previous, out):
         return WRONG_SIZE
     # Two allocations for all scratch: each costs as much as a reflection.
-    work, small = np.empty((WORK_SIZE, n)), np.empty((10, 6))
+    work, small = np.empty((WORK_SIZE, n)), np.empty((11, SMALL))
     matrices, scratch = work[:MATRICES_SIZE], work[MATRICES_SIZE:]
     position = out[6 + n + POSITION : 9 + n + POSITION]
     matrices[:] = 0.0
@@ -635,5 +734,5 @@ def held_command(
     n = columns.shape[1]
     if wrong_size(n, target, target_velocity, previous, out):
         return WRONG_SIZE
-    scratch, small = np.empty((12, n)), np.empty((10, 6))
+    scratch, small = np.empty((SOLVE_ROWS, n)), np.empty((11, SMALL))
     return solve(matrices, U_c, columns, parameters, target, target_velocity, previous, out, scratch, small)

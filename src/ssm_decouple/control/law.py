@@ -68,7 +68,8 @@ class Command:
     def protected_rate(self) -> Floats:
         """Constrained disturbance angular velocity w_sub = J_sub q_dot (k,), rad/s (paper, eq. 6): rounding.
 
-        Of a law with hold nodes, its mean over the hold.
+        Of a law with hold nodes, its mean over the hold. Where a rate was asked for it is that rate, or what of it the
+        arm and its rate limits can give. With directions of the whole twist it mixes m/s and rad/s.
         """
         return self._results(kernel.PROTECTED_RATE, self.k)
 
@@ -89,7 +90,10 @@ class Command:
 
     @property
     def rate_scale(self) -> float:
-        """Factor in (0, 1] that brought the whole rate vector inside the limits."""
+        """Factor in (0, 1] that brought the whole rate vector inside the limits.
+
+        Where a protected rate was asked for, the factor in [0, 1] on what stands beside the rates that give it.
+        """
         return float(self._results(kernel.RATE_SCALE)[0])
 
     @property
@@ -219,13 +223,13 @@ class SelectiveLaw:
             steps = self.acceleration_limits * self.sample_time
         inertial = self.protection.frame == "inertial"
         scalars = [self.gain, self.damping_threshold, self.damping, robot.mass, float(limited), float(inertial)]
-        parameters = np.array([*scalars, *frame.placement.translation])
+        parameters = np.array([*scalars, *frame.placement.translation, 1.0, *np.zeros(6)])
         columns = np.vstack([moves_tool, self.rate_limits, steps])
         data = model.createData()
         # Live views into the Pinocchio data, fetched once: each fetch would cost as much as a tenth of the step.
         placement = data.oMi[frame.parentJoint]
         views = (data.Ag, data.J, placement.rotation, placement.translation)
-        constants = (self.protection.U_c.copy(), columns, parameters)
+        constants = (self.protection.U_twist.copy(), columns, parameters)
         self._prepared = (model, data, views, constants, (*views, *constants))
         # Where continuous joints keep cosine and sine: the matrices do not tell whether these fit.
         circles = np.array([joint.idx_q for joint in model.joints[2:] if joint.nq == 2], dtype=np.int64)
@@ -241,6 +245,8 @@ class SelectiveLaw:
         target: ArrayLike,
         target_velocity: ArrayLike = AT_REST,
         previous_rates: ArrayLike | None = None,
+        protected_rate: ArrayLike | None = None,
+        pace: float = 1.0,
     ) -> Command:
         """Return the command at a configuration.
 
@@ -250,16 +256,23 @@ class SelectiveLaw:
             target_velocity: Its velocity (3,), m/s, inertial axes.
             previous_rates: The joint rates commanded before (n,), rad/s or m/s; needed with an acceleration limit,
                 zeros from rest.
+            protected_rate: b (k,), what J_sub q_dot shall be, rad/s, or m/s and rad/s; None for zero. The arm makes it
+                with the smallest rates J_sub^+ b; the task uses null(J_sub), and yields first at the rate limits. Where
+                J_sub^+ b alone exceeds them it is scaled to them as a whole, and where J_sub has not the rank for b,
+                the nearest b that there is takes its place: the command's `protected_rate` tells.
+            pace: In [0, 1], scales the time of the command but not b: gain, target velocity and rate limits times
+                pace, so that with b = 0 the command is pace times the plain one (damped as that is). Beside rates
+                J_sub^+ b the limits move from these, at pace 0, to the full ones, at pace 1.
 
         Returns:
             The command; its numbers are its own and stay as they are.
 
         Raises:
-            InputError: an argument has the wrong shape or is not finite, q's quaternion is not of unit length, or
-                previous rates are missing.
+            InputError: an argument has the wrong shape or is not finite, q's quaternion is not of unit length, the pace
+                is not in [0, 1], or previous rates are missing.
         """
         values = np.empty(self.size)
-        self.evaluate(q, target, target_velocity, values, previous_rates)
+        self.evaluate(q, target, target_velocity, values, previous_rates, protected_rate, pace)
         return Command(values, self._n, self._k)
 
     def evaluate(
@@ -269,6 +282,8 @@ class SelectiveLaw:
         target_velocity: ArrayLike,
         out: Floats,
         previous_rates: ArrayLike | None = None,
+        protected_rate: ArrayLike | None = None,
+        pace: float = 1.0,
     ) -> None:
         """Compute a command into an array: the same as calling the law, without the result object.
 
@@ -278,10 +293,21 @@ class SelectiveLaw:
             target_velocity: Its velocity (3,), m/s, inertial axes.
             out: Array (law.size,), overwritten: the velocity v (6 + n) and the results that `Command` names.
             previous_rates: The joint rates commanded before (n,).
+            protected_rate: b (k,), what J_sub q_dot shall be, as for the call.
+            pace: In [0, 1], as for the call.
 
         Raises:
             InputError: as for the call.
         """
+        if protected_rate is not None or pace != 1.0:
+            _, _, _, (_, _, parameters), _ = self._prepared
+            usual = parameters.copy()
+            parameters[kernel.PACE :] = self._asked(protected_rate, pace)
+            try:
+                self.evaluate(q, target, target_velocity, out, previous_rates)
+            finally:
+                parameters[:] = usual
+            return
         if previous_rates is None:
             if self.acceleration_limits is not None:
                 raise InputError("an acceleration limit needs previous_rates: those commanded before, zeros from rest")
@@ -353,6 +379,21 @@ class SelectiveLaw:
             if status != kernel.OK or change <= CONVERGED:
                 break
         return status, change
+
+    def _asked(self, protected_rate: ArrayLike | None, pace: float) -> Floats:
+        """Return pace and protected rate as they stand in the kernel's parameters."""
+        asked = np.zeros(kernel.PARAMETERS_SIZE - kernel.PACE)
+        asked[0] = _finite("pace", pace)
+        if not 0.0 <= asked[0] <= 1.0:
+            raise InputError(f"pace is {pace}; it is between 0 (at rest) and 1 (full)")
+        if protected_rate is not None:
+            rate = as_floats("protected_rate", protected_rate)
+            if rate.shape != (self._k,) or not np.all(np.isfinite(rate)):
+                raise InputError(
+                    f"protected_rate is {rate.tolist()}; it needs {self._k} finite numbers, one a column of U_c"
+                )
+            asked[1 : 1 + self._k] = rate
+        return asked
 
     def _checked_rates(self, rates: ArrayLike) -> Floats:
         values = as_floats("previous_rates", rates)

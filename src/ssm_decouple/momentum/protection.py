@@ -1,4 +1,4 @@
-"""The protected subspace U_c: the directions about which the base must not turn."""
+"""The protected subspace U_c: the directions in which the base must not move."""
 
 from __future__ import annotations
 
@@ -17,27 +17,35 @@ Frame = Literal["base", "inertial"]
 
 AXES = {"roll": (1.0, 0.0, 0.0), "pitch": (0.0, 1.0, 0.0), "yaw": (0.0, 0.0, 1.0)}
 NAMES = ("none", *AXES, "all")
+TWIST = ("x", "y", "z", *AXES)  # the rows of a base twist
 TOLERANCE = 1e-3  # how far from orthonormal the given axes may be
+DEPENDENT = 1e-9  # singular value, against the largest, below which unit vectors count as dependent
 
 
 class Protection:
-    """The protected subspace: no base rotation about the columns of U_c (paper, eq. 5).
+    """The protected subspace: no base motion along the columns of U_c (paper, eq. 5, and its like for the whole twist).
+
+    Columns of three numbers are directions about which the base must not turn, as in the paper. Columns of six act on
+    the base twist [linear; angular] of the base origin. They may mix m/s and rad/s, so that "orthonormal" has no
+    meaning in physics for them; the null space of J_sub depends on their span alone, not on the basis.
 
     Args:
-        axes: A direction (3,), columns (3, k) with k up to 3, or a name: "none" (k = 0), "roll", "pitch", "yaw",
-            several joined by "+", or "all" (k = 3, reactionless). Directions must be orthonormal within 1e-3; they are
-            made orthonormal to machine precision by the smallest possible change.
-        frame: The axes in which the directions stay fixed: "base" (the paper's) or "inertial".
+        axes: A direction (3,), columns (3, k) with k up to 3, a twist (6,), columns (6, k) with k up to 6, or a name:
+            "none" (k = 0), "roll", "pitch", "yaw", several joined by "+", or "all" (k = 3, reactionless). They must be
+            orthonormal within 1e-3; they are made orthonormal to machine precision by the smallest possible change.
+        frame: The axes in which the directions stay fixed: "base" (the paper's) or "inertial". Inertial axes turn the
+            linear and the angular part alike; the point is the base origin in both.
 
     Attributes:
-        U_c: Orthonormal columns (3, k), read-only.
+        U_c: Orthonormal columns (3, k) or (6, k), as given, read-only.
+        U_twist: The same on the whole base twist (6, k), read-only: of rotations, U_c below three rows of zeros.
         k: Number of protected directions.
         frame: As given.
         correction: Largest angle, rad, between a given direction and the one used. Scaling to unit length turns
             nothing, so a single direction has 0.
 
     Raises:
-        InputError: a zero, non-unit, non-finite or dependent direction, more than three, or an unknown name.
+        InputError: a zero, non-unit, non-finite or dependent direction, too many, or an unknown name.
 
     Example:
         >>> Protection([0.5, 0, 0.866]).describe()
@@ -51,10 +59,10 @@ class Protection:
         _refuse_far_from_orthonormal(given)
         self.frame: Frame = frame
         self.U_c: Floats = _nearest_orthonormal(given)
-        self.U_c.flags.writeable = False
         self.k: int = self.U_c.shape[1]
-        cross = np.linalg.norm(np.cross(given, self.U_c, axis=0), axis=0)
-        self.correction: float = float(np.max(np.arctan2(cross, np.sum(given * self.U_c, axis=0)), initial=0.0))
+        self.U_twist: Floats = np.vstack([np.zeros((6 - len(self.U_c), self.k)), self.U_c])
+        self.U_c.flags.writeable = self.U_twist.flags.writeable = False
+        self.correction: float = max(map(_angle, given.T, self.U_c.T), default=0.0)
 
     @classmethod
     def boresight(cls, direction: ArrayLike, frame: Frame = "base") -> Protection:
@@ -78,10 +86,47 @@ class Protection:
         return cls(across.T, frame)
 
     @classmethod
+    def from_modes(cls, participation: ArrayLike, frame: Frame = "base") -> Protection:
+        """Protect what excites flexible appendages: the span of their modes' participation vectors.
+
+        Mode j is excited by participation_j . (base acceleration), so a base twist that stays orthogonal to every
+        vector excites none. The vectors are scaled to unit length, and an orthonormal basis of their span is taken by
+        singular value decomposition. It mixes m/s and rad/s, and so do `Command.protected_rate` and its like: the null
+        space, and with it the motion, does not depend on the choice of basis, those numbers do.
+
+        Args:
+            participation: One vector (6,) or columns (6, m): [linear; angular], about the base origin in base axes,
+                of any length. Vectors that depend on the others (within 1e-9 once of unit length) and vectors of
+                zeros, whose mode the base cannot excite, add nothing.
+            frame: The axes in which they stay fixed: "base" for appendages.
+
+        Raises:
+            InputError: not of this shape, not finite, or nothing but zeros.
+        """
+        try:
+            given = np.array(participation, dtype=float)
+        except (TypeError, ValueError):
+            raise InputError(f"participation vectors cannot be read as numbers: {participation!r}") from None
+        columns = given[:, None] if given.ndim == 1 else given
+        if columns.ndim != 2 or columns.shape[0] != 6:
+            raise InputError(
+                f"participation has shape {given.shape}, it needs (6,) or (6, m): a column [linear; angular] a mode"
+            )
+        if not np.all(np.isfinite(columns)):
+            raise InputError(f"participation is not finite: {given.tolist()}")
+        largest = np.abs(columns).max(axis=0, initial=0.0)
+        if not np.any(largest > 0):
+            raise InputError("participation is all zeros: the base excites no such mode; use 'none' to protect nothing")
+        columns = columns[:, largest > 0] / largest[largest > 0]
+        basis, singular, _ = np.linalg.svd(columns / np.linalg.norm(columns, axis=0), full_matrices=False)
+        return cls(basis[:, singular > DEPENDENT * singular[0]], frame)
+
+    @classmethod
     def parse(cls, text: str) -> Protection:
         """Read a protection from one word: a name, or numbers such as "0.5,0,0.866" or "1,0,0;0,0,1".
 
-        Put ";" between directions and "@inertial" behind them where they are fixed in inertial axes.
+        Give three numbers a direction or six a twist. Put ";" between directions and "@inertial" behind them where they
+        are fixed in inertial axes.
 
         Raises:
             InputError: as for the class, or the text cannot be read.
@@ -114,15 +159,15 @@ class Protection:
         return f"k = {self.k}, {self.frame} axes: {'; '.join(words)}{turned}"
 
     def U_c_in(self, coupling: Coupling) -> Floats:
-        """Return U_c (3, k) in the axes of the coupling's matrices."""
+        """Return U_c, (3, k) or (6, k) as it was given, in the axes of the coupling's matrices."""
         if self.frame == coupling.frame:
             return self.U_c
-        R = coupling.base_rotation
-        return R @ self.U_c if self.frame == "base" else R.T @ self.U_c
+        R = coupling.base_rotation if self.frame == "base" else coupling.base_rotation.T
+        return np.vstack([R @ part for part in np.split(self.U_c, len(self.U_c) // 3)])
 
     def J_sub(self, coupling: Coupling) -> Floats:
-        """Return the sub-coupling matrix J_sub = U_c^T J_rc (k, n), rad/s per joint rate (paper, eq. 7)."""
-        return self.U_c_in(coupling).T @ coupling.J_rc
+        """Return the sub-coupling matrix (k, n): U_c^T J_rc, rad/s per joint rate (paper, eq. 7), or U_c^T J_base."""
+        return self.U_c_in(coupling).T @ self._map(coupling)
 
     def null_space_basis(self, coupling: Coupling) -> Floats:
         """Return orthonormal columns Z (n, n - rank J_sub) that span null(J_sub)."""
@@ -131,8 +176,8 @@ class Protection:
         if self.k == 0:
             return np.eye(n)
         _, singular, rows = np.linalg.svd(J_sub)
-        # Below the rounding of J_rc a row is no constraint.
-        rank = int(np.sum(singular > 16 * np.finfo(float).eps * np.linalg.norm(coupling.J_rc)))
+        # Below the rounding of J_rc or J_base a row is no constraint.
+        rank = int(np.sum(singular > 16 * np.finfo(float).eps * np.linalg.norm(self._map(coupling))))
         return rows[rank:].T
 
     def N_sub(self, coupling: Coupling) -> Floats:
@@ -140,8 +185,14 @@ class Protection:
         Z = self.null_space_basis(coupling)
         return Z @ Z.T
 
+    def _map(self, coupling: Coupling) -> Floats:
+        return coupling.J_rc if len(self.U_c) == 3 else coupling.J_base
 
-_HELP = f"a name ({', '.join(NAMES)}, or several joined by '+') or numbers, '0.5,0,0.866' or '1,0,0;0,0,1'"
+
+_HELP = (
+    f"a name ({', '.join(NAMES)}, or several joined by '+') or numbers, '0.5,0,0.866' or '1,0,0;0,0,1', three a "
+    "rotation or six a twist"
+)
 
 
 def _named(name: str) -> Floats:
@@ -162,12 +213,17 @@ def _columns(axes: ArrayLike) -> Floats:
     except (TypeError, ValueError):
         raise InputError(f"U_c cannot be read as numbers: {axes!r}; give {_HELP}") from None
     columns = given[:, None] if given.ndim == 1 else given
-    if columns.ndim != 2 or columns.shape[0] != 3:
-        hint = "; its transpose would do: directions are columns" if columns.ndim == 2 and columns.shape[1] == 3 else ""
-        raise InputError(f"U_c has shape {given.shape}, it needs (3,) or (3, k) with k up to 3{hint}")
-    if columns.shape[1] > 3:
+    rows, k = columns.shape if columns.ndim == 2 else (0, 0)
+    if rows not in (3, 6) or (rows, k) == (3, 6):
+        hint = "; its transpose would do: directions are columns" if k in (3, 6) else ""
         raise InputError(
-            f"U_c has k = {columns.shape[1]} directions; space has 3: keep an orthonormal basis of their span"
+            f"U_c has shape {given.shape}, it needs (3,) or (3, k) with k up to 3 for rotations, (6,) or (6, k) with k "
+            f"up to 6 for twists{hint}"
+        )
+    if k > rows:
+        raise InputError(
+            f"U_c has k = {k} directions; {'space' if rows == 3 else 'a twist'} has {rows}: keep an orthonormal basis "
+            "of their span"
         )
     return columns
 
@@ -208,8 +264,13 @@ def _nearest_orthonormal(columns: Floats) -> Floats:
     return 0.5 * nearest @ (3.0 * np.eye(nearest.shape[1]) - nearest.T @ nearest)
 
 
+def _angle(given: Floats, used: Floats) -> float:
+    across = np.outer(given, used)
+    return float(np.arctan2(np.linalg.norm(across - across.T) / np.sqrt(2), given @ used))
+
+
 def _nearest_axis(direction: Floats) -> tuple[str, float]:
-    names = list(AXES)
+    names = TWIST[-len(direction) :]
     best = int(np.argmax(np.abs(direction)))
     across = np.linalg.norm(np.delete(direction, best))
     return names[best], float(np.arctan2(across, abs(direction[best])))
