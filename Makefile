@@ -3,13 +3,16 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: cases test lint types snippets tables wheel benchmarks clean
+.PHONY: cases test slow lint types snippets tables wheel benchmarks clean
 
 cases: .venv/installed
 	$(BIN)/ssm-decouple compare all --output results
 
 test: .venv/installed-dev
 	$(BIN)/python -m pytest
+
+slow: .venv/installed-dev
+	$(BIN)/python -m pytest -m slow
 
 lint: .venv/installed-dev
 	$(BIN)/ruff check .
@@ -37,6 +40,7 @@ wheel: .venv/installed-dev
 
 benchmarks: .venv/installed-bench
 	$(BIN)/python benchmarks/control_step.py
+	$(BIN)/python benchmarks/dynamic.py
 	$(BIN)/python benchmarks/start_up.py
 
 clean:

@@ -184,3 +184,47 @@ def test_ctrl_c_keeps_what_is_done(short_case, write, tmp_path):
     assert partial.attrs["outcome"] in ("running", "converged")
     assert 2 < partial.time.values[-1] < 1e6
     assert not list(Path(tmp_path).rglob("*.part*"))
+
+
+def test_the_equations_of_motion_from_the_command_line(short_case, tmp_path):
+    done = call("run", short_case, "--dynamic", "--no-figures", "-o", tmp_path, "--json")
+    assert done.returncode == 3, done.stderr
+    motion = ssm.load_motion(tmp_path / "short" / "selective.nc")
+    assert motion.attrs["method"] == "dynamic"
+    assert motion.attrs["energy_error"] < 1e-9
+    assert float(abs(motion.joint_torques).max()) > 0
+
+
+@pytest.mark.parametrize(
+    ("study", "more", "columns", "per_case"),
+    [
+        ("bending", [], "symmetric_mm", {"bending.pdf", "bending_none.nc", "bending_bending_modes.nc"}),
+        ("pointing", ["--step", "0.01"], "peak_arcsec", {"pointing.png", "pointing_selective_planned.nc"}),
+    ],
+)
+def test_a_study_writes_its_table_figures_and_motions(short_case, tmp_path, study, more, columns, per_case):
+    done = call("study", study, short_case, "-o", tmp_path, *more)
+    assert done.returncode == 0, done.stderr
+    assert columns in (tmp_path / f"{study}.csv").read_text().splitlines()[0]
+    assert per_case <= {path.name for path in (tmp_path / "short").iterdir()}
+    assert "files in" in done.stdout
+
+
+def test_the_robustness_study(short_case, tmp_path):
+    words = ("study", "robustness", short_case, "-o", tmp_path, "--runs", "2", "--levels", "1,5", "--json")
+    done = call(*words)
+    assert done.returncode == 0, done.stderr
+    rows = json.loads(done.stdout)["rows"]
+    assert [(row["level"], row["feedback_gain"], row["runs"]) for row in rows] == [
+        (0.01, 0.0, 2),
+        (0.01, 1.0, 2),
+        (0.05, 0.0, 2),
+        (0.05, 1.0, 2),
+    ]
+    assert {path.name for path in tmp_path.iterdir()} >= {"robustness.csv", "effects.csv", "robustness.pdf"}
+
+
+def test_numbers_that_cannot_be_read(short_case, tmp_path):
+    done = call("study", "pointing", short_case, "-o", tmp_path, "--boresight", "up")
+    assert done.returncode == 1
+    assert "--boresight is 'up'; give numbers with commas between them" in done.stderr

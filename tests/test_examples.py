@@ -11,8 +11,11 @@ PRINTS = {
     "case1": "converged at 102.0 s, 0.90 mm left",
     "case2": "converged at 137.2 s, 5.25 mm left",
     "case3": "case3 | selective | 2 | converged, 97 s | 0.70",
+    "bending": "protected: bending modes   tip   0.001",
     "own_axis": "of 40 directions can be protected",
     "own_robot": "yaw       converged",
+    "pointing": "selective              at most    1.31",
+    "robustness": "5 % off, plant 2",
 }
 
 

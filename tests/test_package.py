@@ -35,9 +35,34 @@ def test_imports_run_from_right_to_left(path):
             assert ROOMS.index(used) <= ROOMS.index(room), f"{parts} imports from {used}"
 
 
-def test_compiled_functions_stand_in_one_file():
-    compiled = [path.name for path in SOURCE.rglob("*.py") if "numba" in path.read_text().split('"""', 2)[-1]]
-    assert [name for name in compiled if name != "motion.py"] == ["kernel.py"]  # motion.py records numba's version
+def is_compiled(function: ast.AST) -> bool:
+    return isinstance(function, ast.FunctionDef) and any(
+        name.id in ("compiled", "compiled_for", "inlined")
+        for decorator in function.decorator_list
+        for name in ast.walk(decorator)
+        if isinstance(name, ast.Name)
+    )
+
+
+def test_compiled_functions_call_only_those_of_their_own_file():
+    """Numba watches one file: what is called from another would stay as it was compiled."""
+    trees = {path.name: ast.parse(path.read_text()) for path in SOURCE.rglob("*.py")}
+    compiled = {name: {f.name: f for f in tree.body if is_compiled(f)} for name, tree in trees.items()}
+    assert sorted(name for name in compiled if compiled[name]) == ["kernel.py", "physics.py"]
+    with_numba = {path.name for path in SOURCE.rglob("*.py") if "numba" in path.read_text().split('"""', 2)[-1]}
+    assert with_numba <= {"kernel.py", "motion.py"}  # motion.py records its version, the others take their decorators
+    for name, functions in compiled.items():
+        own = {part.name for part in trees[name].body if isinstance(part, ast.FunctionDef)}
+        imported = {
+            alias.asname or alias.name
+            for part in ast.walk(trees[name])
+            if isinstance(part, ast.ImportFrom)
+            for alias in part.names
+        }
+        for function in functions.values():
+            called = {node.id for part in function.body for node in ast.walk(part) if isinstance(node, ast.Name)}
+            assert not called & imported, f"{name}: {function.name} uses {called & imported} of another file"
+            assert called & own <= functions.keys(), f"{name}: {function.name} uses a function that is not compiled"
 
 
 def test_every_public_name_is_there_and_described():

@@ -24,16 +24,26 @@ if TYPE_CHECKING:
     from ssm_decouple.errors import FileError as FileError
     from ssm_decouple.errors import InputError as InputError
     from ssm_decouple.errors import ModelError as ModelError
+    from ssm_decouple.model.appendage import Appendage as Appendage
+    from ssm_decouple.model.appendage import Modes as Modes
     from ssm_decouple.model.catalogue import example_robot as example_robot
     from ssm_decouple.model.catalogue import load_robot as load_robot
     from ssm_decouple.model.catalogue import models as models
     from ssm_decouple.model.compose import compose as compose
+    from ssm_decouple.model.perturb import Tolerances as Tolerances
+    from ssm_decouple.model.perturb import perturbed as perturbed
+    from ssm_decouple.model.plant import Plant as Plant
     from ssm_decouple.model.report import Report as Report
     from ssm_decouple.model.robot import Robot as Robot
     from ssm_decouple.momentum.coupling import Coupling as Coupling
     from ssm_decouple.momentum.protection import Protection as Protection
+    from ssm_decouple.simulation.dynamic import Dynamic as Dynamic
+    from ssm_decouple.simulation.dynamic import Load as Load
+    from ssm_decouple.simulation.dynamic import Sensors as Sensors
+    from ssm_decouple.simulation.dynamic import Servo as Servo
     from ssm_decouple.simulation.motion import load_motion as load_motion
     from ssm_decouple.simulation.motion import save_motion as save_motion
+    from ssm_decouple.simulation.simulate import SimulationDiverged as SimulationDiverged
     from ssm_decouple.simulation.simulate import SimulationInterrupted as SimulationInterrupted
     from ssm_decouple.simulation.simulate import simulate as simulate
     from ssm_decouple.studies.case import Case as Case
@@ -46,20 +56,29 @@ __version__ = "0.1.0"
 
 # Each public name and the module that it comes from: imported when first used, so that `import ssm_decouple` is quick.
 _HOME = {
+    "Appendage": "model.appendage",
     "Case": "studies.case",
     "Command": "control.law",
     "Comparison": "studies.comparison",
     "Coupling": "momentum.coupling",
     "DecoupleError": "errors",
     "DecoupleWarning": "errors",
+    "Dynamic": "simulation.dynamic",
     "FileError": "errors",
     "InputError": "errors",
+    "Load": "simulation.dynamic",
     "ModelError": "errors",
+    "Modes": "model.appendage",
+    "Plant": "model.plant",
     "Protection": "momentum.protection",
     "Report": "model.report",
     "Robot": "model.robot",
     "SelectiveLaw": "control.law",
+    "Sensors": "simulation.dynamic",
+    "Servo": "simulation.dynamic",
+    "SimulationDiverged": "simulation.simulate",
     "SimulationInterrupted": "simulation.simulate",
+    "Tolerances": "model.perturb",
     "cases": "studies.case",
     "compare": "studies.comparison",
     "compose": "model.compose",
@@ -68,6 +87,7 @@ _HOME = {
     "load_motion": "simulation.motion",
     "load_robot": "model.catalogue",
     "models": "model.catalogue",
+    "perturbed": "model.perturb",
     "save_motion": "simulation.motion",
     "simulate": "simulation.simulate",
 }

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
@@ -9,7 +10,7 @@ from random_robots import random_robot, random_state
 
 import ssm_decouple as ssm
 from ssm_decouple import Protection, SelectiveLaw
-from ssm_decouple.simulation.motion import judge
+from ssm_decouple.simulation.motion import judge, protected_integral
 
 START = np.deg2rad([150, -20, -10, 0, 0, 0])
 TARGET = [-1.8, -0.3, 1.2]
@@ -145,6 +146,122 @@ def test_protection_fixed_in_inertial_axes(ets_vii):
     assert np.abs(motion.protected_angle).max() < 1e-14
 
 
+# Directions of the whole base twist.
+
+
+def modes(robot) -> Protection:
+    """Two made-up modes of appendages: one feels the base's z acceleration, one its x and yaw."""
+    return Protection.from_modes(np.array([[0, 0, 8.0, 3.0, 0, 0], [5.0, 0, 0, 0, -1.0, 4.0]]).T)
+
+
+@pytest.mark.parametrize("method", ["explicit", "held", "rk4"])
+def test_the_integral_of_the_twist_is_what_it_says(ets_vii, method):
+    """Against the poses: an explicit step is its own logarithm, the others are up to commutators of third order."""
+    law = SelectiveLaw(ets_vii, Protection("none"), gain=0.2, rate_limit=np.inf)
+    motion = ssm.simulate(law, ets_vii.configuration(START), TARGET, 4.0, 0.02, method=method)
+    assert motion.base_twist_integral.dims == ("time", "twist")
+    assert list(motion.twist.values) == ["vx", "vy", "vz", "wx", "wy", "wz"]
+    poses = [ets_vii.base_pose(q) for q in motion.configuration.values]
+    steps = np.array([pin.log6(a.actInv(b)).vector for a, b in itertools.pairwise(poses)])
+    summed = np.vstack([np.zeros(6), np.cumsum(steps, axis=0)])
+    size = np.abs(summed).max(axis=0)
+    assert size.min() > 1e-6
+    np.testing.assert_allclose(
+        motion.base_twist_integral, summed, atol=1e-15 if method == "explicit" else 1e-6 * size.max()
+    )
+
+
+@pytest.mark.parametrize("method", ["explicit", "held", "rk4"])
+def test_modes_of_appendages_are_not_excited(ets_vii, method):
+    protection = modes(ets_vii)
+    law = SelectiveLaw(ets_vii, protection)
+    if method == "held":
+        law = SelectiveLaw(ets_vii, protection, sample_time=0.1, hold_nodes=3)
+    motion = ssm.simulate(law, ets_vii.configuration(START), TARGET, 60.0, 0.1, method=method)
+    assert motion.U_c.dims == ("twist", "protected")
+    np.testing.assert_array_equal(motion.U_c, protection.U_twist)
+    assert json.loads(motion.attrs["law"])["U_c"] == protection.U_c.tolist()
+    assert np.abs(motion.protected_rate).max() < 1e-17
+    np.testing.assert_array_equal(motion.protected_angle, motion.base_twist_integral.values @ protection.U_twist)
+    assert np.abs(motion.base_twist_integral.values).max() > 1e-3
+    # rk4 takes the integral by its own quadrature, on stages that are each protected.
+    assert np.abs(motion.protected_angle).max() < 1e-14
+
+
+def test_twists_fixed_in_inertial_axes(ets_vii, rng):
+    pose = pin.SE3(pin.rpy.rpyToMatrix(0.4, -0.3, 1.1), np.array([0.5, -1.0, 2.0]))
+    q, target = ets_vii.configuration(START, pose), pose.act(np.array(TARGET))
+    protection = Protection([0, 1, 0, 0, 0, 0], "inertial")
+    motion = ssm.simulate(SelectiveLaw(ets_vii, protection), q, target, 60.0, 0.1, method="rk4")
+    way = motion.base_position.values - motion.base_position.values[0]
+    assert np.abs(way[:, [0, 2]]).max() > 1e-3
+    assert np.abs(way[:, 1]).max() < 1e-9  # the base origin keeps its inertial y
+    np.testing.assert_array_equal(motion.protected_angle.values[:, 0], way[:, 1])
+    assert np.abs(motion.protected_rate).max() < 1e-17
+    # A mixed direction under another law: the integral of its rate.
+    mixed = np.linalg.qr(rng.normal(size=(6, 2)))[0]
+    free = ssm.simulate(SelectiveLaw(ets_vii, Protection("none")), q, target, 20.0, 0.05, method="rk4")
+    along = protected_integral(mixed, "inertial", free.base_twist_integral.values, free.configuration.values)
+    R = np.array([ets_vii.base_pose(q).rotation for q in free.configuration.values])
+    twist = np.hstack(
+        [np.einsum("tij,tj->ti", R, free[name].values) for name in ("base_linear_velocity", "base_angular_velocity")]
+    )
+    trapezoids = np.cumsum(0.025 * (twist[1:] + twist[:-1]), axis=0) @ mixed
+    np.testing.assert_allclose(along[1:], trapezoids, atol=1e-6)
+    assert np.abs(along).max() > 1e-3
+
+
+# Smooth starts.
+
+
+@pytest.mark.parametrize(("method", "nodes"), [("explicit", 0), ("held", 0), ("held", 2), ("rk4", 0)])
+def test_a_smooth_start_has_no_jump_and_keeps_the_protection(ets_vii, method, nodes):
+    """Accelerations from rest on: their jumps shrink with the time between samples, those of a plain start grow."""
+
+    def jump(dt: float, smooth_start: float) -> float:
+        options = {"sample_time": dt, "hold_nodes": nodes} if nodes else {}
+        law = SelectiveLaw(ets_vii, Protection("yaw"), gain=0.05, rate_limit=np.inf, **options)
+        motion = ssm.simulate(
+            law, ets_vii.configuration(START), TARGET, 16.0, dt, method=method, smooth_start=smooth_start
+        )
+        assert motion.attrs["smooth_start"] == smooth_start
+        assert np.abs(motion.protected_rate).max() < 1e-17
+        rates = np.vstack([np.zeros((2, 6)), motion.joint_rates.values])
+        return float(np.abs(np.diff(rates, 2, axis=0)).max() / dt)
+
+    assert jump(0.05, 8.0) < 0.002
+    assert jump(0.05, 8.0) < 0.6 * jump(0.1, 8.0)
+    assert jump(0.05, 0.0) > 1.9 * jump(0.1, 0.0) > 0.5
+
+
+@pytest.mark.parametrize(("method", "lead"), [("explicit", 0.05), ("held", 0.05), ("rk4", 0.0)])
+def test_the_pace_of_a_smooth_start(ets_vii, method, lead):
+    law = SelectiveLaw(ets_vii, Protection("yaw"))
+    motion = ssm.simulate(law, ets_vii.configuration(START), TARGET, 6.0, 0.1, method=method, smooth_start=4.0)
+    for i in (0, 7, 20, 39, 40, 60):
+        x = min(1.0, (motion.time.values[i] + lead) / 4.0)
+        plain = law(motion.configuration.values[i], TARGET).joint_rates
+        pace = 10 * x**3 - 15 * x**4 + 6 * x**5
+        np.testing.assert_allclose(motion.joint_rates.values[i], pace * plain, atol=1e-14)
+
+
+def test_a_smooth_start_keeps_the_order_of_runge_and_kutta(ets_vii):
+    def end(dt):
+        q = ets_vii.configuration(START)
+        motion = ssm.simulate(smooth_law(ets_vii), q, TARGET, 4.0, dt, method="rk4", smooth_start=4.0)
+        return motion.configuration.values[-1]
+
+    truth = end(0.02)
+    errors = [np.linalg.norm(pin.difference(ets_vii.model, truth, end(dt))) for dt in (0.8, 0.4, 0.2)]
+    np.testing.assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 4, atol=0.5)
+
+
+def test_slow_on_purpose_is_not_stalled(ets_vii):
+    law = SelectiveLaw(ets_vii, Protection("yaw"), gain=0.5)
+    motion = ssm.simulate(law, ets_vii.configuration(START), TARGET, 150.0, 0.1, stop_early=True, smooth_start=100.0)
+    assert motion.attrs["outcome"] == "converged"
+
+
 def test_a_moving_target_is_followed_without_lag(ets_vii):
     """Feed-forward, x_dot_des in the paper's eq. 9: without it the error would settle at speed / gain = 0.1 m."""
     q = ets_vii.configuration(START)
@@ -241,6 +358,9 @@ def test_a_target_out_of_reach_warns_by_how_much_and_runs(ets_vii):
         ({"target": [0, 0]}, "it needs 3 finite numbers"),
         ({"arrival_tolerance": 0.0}, "arrival_tolerance is 0.0"),
         ({"q": np.zeros(13)}, "length 0, not 1"),
+        ({"smooth_start": -1.0}, "smooth_start is -1.0; it must be zero or a positive time"),
+        ({"smooth_start": np.inf}, "smooth_start is inf"),
+        ({"smooth_start": np.nan}, "smooth_start is nan"),
     ],
 )
 def test_bad_input_is_refused(ets_vii, options, says):
@@ -252,7 +372,7 @@ def test_bad_input_is_refused(ets_vii, options, says):
 # On disk.
 
 
-@pytest.mark.parametrize("axes", ["none", "yaw", "all"])
+@pytest.mark.parametrize("axes", ["none", "yaw", "all", np.eye(6)[:, [2, 4]]])
 def test_a_motion_survives_the_round_trip(ets_vii, tmp_path, axes):
     law = SelectiveLaw(ets_vii, Protection(axes))
     motion = ssm.simulate(law, ets_vii.configuration(START), TARGET, 5.0, 0.1)

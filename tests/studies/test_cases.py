@@ -121,8 +121,32 @@ def test_disturbance_under_another_law_is_about_the_case_s_axes(compared):
     np.testing.assert_allclose(angle[1:], np.cumsum(rate[:-1] * 0.1, axis=0), atol=1e-12)
 
 
+def test_disturbance_along_twists(compared):
+    """A case that protects rows of the whole twist: what each law does along them."""
+    rng = np.random.default_rng(5)
+    U_c = np.linalg.qr(rng.normal(size=(6, 2)))[0]
+    for frame in ("base", "inertial"):
+        case = dataclasses.replace(
+            compared["case2"].case, protection=ssm.Protection(U_c, frame), duration=10.0, title="modes"
+        )
+        comparison = ssm.compare(case)
+        own, free = comparison.motions["selective"], comparison.motions["none"]
+        np.testing.assert_array_equal(disturbance(own)[0], own.protected_rate)
+        assert np.abs(disturbance(own)[0]).max() < 1e-17
+        rate, angle = disturbance(free)
+        R = [case.robot.base_pose(q).rotation if frame == "inertial" else np.eye(3) for q in free.configuration.values]
+        linear, angular = free.base_linear_velocity.values, free.base_angular_velocity.values
+        expected = [U_c.T @ np.r_[r @ v, r @ w] for r, v, w in zip(R, linear, angular, strict=True)]
+        np.testing.assert_allclose(rate, expected, atol=1e-16)
+        np.testing.assert_allclose(angle[1:], np.cumsum(rate[:-1] * 0.1, axis=0), atol=1e-4 * np.abs(angle).max())
+
+
 def test_the_case_s_own_protection_is_not_compared_twice():
     case = ssm.load_case("case1")
+    three = ssm.Protection(np.eye(6)[:, [0, 2, 4]])
+    assert list(laws_of(dataclasses.replace(case, protection=three))) == ["none", "selective", "reactionless"]
+    turns = ssm.Protection(np.eye(6)[:, 3:])
+    assert list(laws_of(dataclasses.replace(case, protection=turns))) == ["none", "selective"]
     assert list(laws_of(dataclasses.replace(case, protection=ssm.Protection("none")))) == ["none", "reactionless"]
     assert list(laws_of(dataclasses.replace(case, protection=ssm.Protection("all")))) == ["none", "selective"]
 
@@ -147,6 +171,19 @@ def test_a_minimal_case_of_one_s_own(write):
     assert motion.attrs["case"] == "mine"
     assert motion.sizes["time"] == 11
     assert summarise(motion, "selective").k == 1
+
+
+def test_a_case_with_twists_and_a_smooth_start(write):
+    text = MINIMAL.replace('axes = "yaw"', "axes = [[0, 0, 1, 0, 0, 0], [0, 0, 0, 0, 1, 0]]")
+    case = ssm.load_case(write(text + "smooth_start = 0.5", "mine.toml"))
+    np.testing.assert_array_equal(case.protection.U_c, np.eye(6)[:, [2, 4]])
+    motion = case.run()
+    assert motion.attrs["smooth_start"] == 0.5
+    speed = np.abs(motion.joint_rates.values).max(axis=1)
+    assert speed[0] < 0.02 * speed[5]
+    assert summarise(motion, "selective").k == 2
+    with pytest.raises(ssm.InputError, match="case 'mine': smooth_start is -1"):
+        ssm.load_case(write(MINIMAL + "smooth_start = -1", "mine.toml")).run()
 
 
 def test_everything_a_case_can_say(write, tmp_path):
@@ -175,7 +212,7 @@ def test_everything_a_case_can_say(write, tmp_path):
     dt = 0.5
     method = "rk4"
     arrival_tolerance = 0.02
-    [figure]
+    [spacecraft]
     turned_deg = { wing_left = 10 }
     """
     case = ssm.load_case(write(text, "mine.toml"))
@@ -208,6 +245,7 @@ def test_everything_a_case_can_say(write, tmp_path):
         (('axes = "yaw"', "axes = [[0, 0]]"), "each direction needs 3 numbers"),
         (('axes = "yaw"', "axes = [[1, 0, 0], [0, 1]]"), "each direction needs 3 numbers"),
         (('axes = "yaw"', "axes = [[1, 0, 0], 1]"), "each direction needs 3 numbers"),
+        (('axes = "yaw"', "axes = [[1, 0, 0], [0, 1, 0, 0, 0, 0]]"), "each direction needs 3 numbers, or each 6"),
         (('axes = "yaw"', 'axes = "yaw"\nframe = "body"'), "frame is 'base' or 'inertial'"),
         (("[target]", "law = 3\n[target]"), r"'law' must be a table: write \[law\]"),
         (("[target]", "[start]\njoints = [0]\njoints_deg = [0]\n[target]"), "tables by joint name that share none"),

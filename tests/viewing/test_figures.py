@@ -125,6 +125,22 @@ def test_a_motion_without_protection_can_be_drawn(compared):
     figures.configuration(none)
 
 
+def test_protected_twists_are_drawn_with_their_units():
+    import dataclasses
+
+    rows = np.eye(6)[:, [0, 1, 2, 4]]
+    case = dataclasses.replace(ssm.load_case("case1"), protection=ssm.Protection(rows), duration=2.0)
+    motions = ssm.compare(case).motions
+    (axes,) = figures.protected_rate(motions["selective"]).axes
+    assert "m/s, rad/s" in axes.get_ylabel()
+    assert [text.get_text() for text in axes.get_legend().get_texts()][3] == "along (0, 0, 0, 0, 1, 0)"
+    assert len({to_hex(line.get_color()) for line in axes.lines}) == 4
+    assert "m/s, rad/s" in figures.comparison(motions).axes[1].get_ylabel()
+    # Only the fourth is an axis.
+    drawn = figures.configuration(motions["selective"]).axes[0]
+    assert sum(line.get_color() == style.PROTECTED for line in drawn.lines) == 1
+
+
 def test_a_robot_of_meshes_can_be_drawn(robots):
     robot = robots["composed"]
     law = ssm.SelectiveLaw(robot, ssm.Protection("yaw"))

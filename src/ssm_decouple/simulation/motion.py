@@ -75,14 +75,19 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "base_rpy": (("time", "axis"), "rad", "base to inertial", "roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll)"),
     "base_linear_velocity": (("time", "axis"), "m/s", "base", "velocity of the base origin"),
     "base_angular_velocity": (("time", "axis"), "rad/s", "base", "angular velocity of the base"),
-    "base_rotation_integral": (("time", "axis"), "rad", "base", "integral of the base angular velocity from the start"),
+    "base_twist_integral": (("time", "twist"), "m, rad", "base", "integral of the base twist from the start"),
     "protected_rate": (
         ("time", "protected"),
-        "rad/s",
+        "rad/s, or m/s and rad/s",
         "U_c",
-        "U_c^T omega as the law sees it: at the sample, or its mean over the hold",
+        "U_c^T (base twist) as the law sees it: at the sample, or its mean over the hold",
     ),
-    "protected_angle": (("time", "protected"), "rad", "U_c", "integral of the true rate about the protected axes"),
+    "protected_angle": (
+        ("time", "protected"),
+        "rad, or m and rad",
+        "U_c",
+        "integral of the true rate along the protected directions",
+    ),
     "end_effector_position": (("time", "axis"), "m", "inertial", "end-effector"),
     "target_position": (("time", "axis"), "m", "inertial", "where the end-effector should be"),
     "end_effector_error": (("time",), "m", "", "distance from the end-effector to the target"),
@@ -99,35 +104,41 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
         "inertial",
         "audit: centre of mass of the whole, at rest if all is right",
     ),
-    "U_c": (("axis", "protected"), "1", "", "protected directions, columns, in the axes that the law's settings name"),
+    "U_c": (
+        ("twist", "protected"),
+        "1",
+        "",
+        "protected directions of the base twist, columns, in the axes that the law's settings name",
+    ),
     "robot_urdf": ((), "", "", "the robot, so that the motion can be drawn anywhere"),
 }
 
 
-def rotation_about(U_c: Floats, frame: str, turns: Floats, quaternions: Floats) -> Floats:
-    """Return how far the base has turned about directions since the start (m, k), rad.
+def protected_integral(U_twist: Floats, frame: str, twists: Floats, configurations: Floats) -> Floats:
+    """Return how far the base has moved along directions of its twist since the start (m, k), m and rad.
 
-    About directions fixed in base axes this is the integral of their components of the angular velocity. About
-    directions fixed in inertial axes the rotations from sample to sample are summed, which is that integral to second
-    order in the time between samples.
+    Along directions fixed in base axes this is the integral of the twist's components. Along directions fixed in
+    inertial axes the linear part is the displacement of the base origin, and for the angular part the rotations from
+    sample to sample are summed, which is its integral to second order in the time between samples.
 
     Args:
-        U_c: Directions, columns (3, k).
+        U_twist: Directions of the base twist, columns (6, k).
         frame: "base" or "inertial".
-        turns: Integral of the base angular velocity, base axes (m, 3), rad.
-        quaternions: Base attitudes (m, 4), x y z w.
+        twists: Integral of the base twist, base axes (m, 6), m and rad.
+        configurations: Configurations (m, nq), of which the base poses are read.
     """
     from scipy.spatial.transform import Rotation
 
-    if frame == "base" or len(turns) == 1:
-        return turns @ U_c
-    attitude = Rotation.from_quat(quaternions)
-    steps = (attitude[1:] * attitude[:-1].inv()).as_rotvec() @ U_c
-    return np.vstack([np.zeros((1, U_c.shape[1])), np.cumsum(steps, axis=0)])
+    if frame == "base" or len(twists) == 1:
+        return twists @ U_twist
+    attitude = Rotation.from_quat(np.ascontiguousarray(configurations[:, 3:7]))
+    turns = np.zeros((len(twists), 3))
+    turns[1:] = np.cumsum((attitude[1:] * attitude[:-1].inv()).as_rotvec(), axis=0)
+    return np.hstack([configurations[:, :3] - configurations[0, :3], turns]) @ U_twist
 
 
 def build_motion(
-    law: SelectiveLaw, time: Floats, configurations: Floats, values: Floats, turns: Floats, targets: Floats
+    law: SelectiveLaw, time: Floats, configurations: Floats, values: Floats, twists: Floats, targets: Floats
 ) -> xr.Dataset:
     """Assemble the record of a motion from its samples.
 
@@ -136,7 +147,7 @@ def build_motion(
         time: Sample times (m,), s.
         configurations: Configurations (m, nq).
         values: The law's output arrays (m, law.size).
-        turns: Integral of the base angular velocity, base axes (m, 3), rad.
+        twists: Integral of the base twist, base axes (m, 6), m and rad.
         targets: Target positions (m, 3), m, inertial axes.
 
     Returns:
@@ -165,10 +176,8 @@ def build_motion(
         "base_linear_velocity": values[:, :3],
         "base_angular_velocity": values[:, 3:6],
         "protected_rate": results[:, kernel.PROTECTED_RATE : kernel.PROTECTED_RATE + k],
-        "base_rotation_integral": turns,
-        "protected_angle": rotation_about(
-            law.protection.U_c, law.protection.frame, turns, np.ascontiguousarray(configurations[:, 3:7])
-        ),
+        "base_twist_integral": twists,
+        "protected_angle": protected_integral(law.protection.U_twist, law.protection.frame, twists, configurations),
         "end_effector_position": results[:, kernel.POSITION : kernel.POSITION + 3],
         "target_position": targets,
         "end_effector_error": np.linalg.norm(results[:, kernel.ERROR : kernel.ERROR + 3], axis=1),
@@ -180,7 +189,7 @@ def build_motion(
         "linear_momentum": momenta[:, :3],
         "angular_momentum": momenta[:, 3:],
         "centre_of_mass": centres,
-        "U_c": law.protection.U_c,
+        "U_c": law.protection.U_twist,
         "robot_urdf": np.array(robot.urdf, dtype=object),
     }
     variables = {}
@@ -191,6 +200,7 @@ def build_motion(
         "time": ("time", time, {"units": "s"}),
         "joint": list(robot.joint_names),
         "axis": ["x", "y", "z"],
+        "twist": ["vx", "vy", "vz", "wx", "wy", "wz"],
         "protected": list(range(1, k + 1)),
         "quaternion": ["x", "y", "z", "w"],
     }

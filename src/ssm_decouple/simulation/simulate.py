@@ -1,4 +1,4 @@
-"""Kinematic simulation: the law closes the loop, the momentum law moves the base."""
+"""Simulation: the law closes the loop; the momentum law, or the equations of motion under torques, move the base."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import AT_REST, SelectiveLaw
-from ssm_decouple.errors import DecoupleWarning, InputError, as_floats
+from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_floats
+from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import build_motion, judge
-from ssm_decouple.simulation.steps import STEPS, Reference
+from ssm_decouple.simulation.steps import STEPS, Pace, Reference
 
 Floats = NDArray[np.float64]
 Method = Literal["explicit", "held", "rk4"]
@@ -33,16 +34,25 @@ class SimulationInterrupted(KeyboardInterrupt):
         self.motion = motion
 
 
+class SimulationDiverged(DecoupleError, ArithmeticError):
+    """A dynamic simulation whose numbers have run away; `motion` holds the samples before."""
+
+    def __init__(self, message: str, motion: xr.Dataset) -> None:
+        super().__init__(message)
+        self.motion = motion
+
+
 def simulate(
     law: SelectiveLaw,
     q: ArrayLike,
     target: ArrayLike | Target,
     duration: float,
     dt: float,
-    method: Method = "explicit",
+    method: Method | Dynamic = "explicit",
     arrival_tolerance: float = 0.01,
     stop_early: bool = False,
     progress: Progress | None = None,
+    smooth_start: float = 0.0,
 ) -> xr.Dataset:
     """Simulate the arm moving under a law while momentum turns and shifts the free base, from rest.
 
@@ -56,98 +66,161 @@ def simulate(
         method: "explicit" holds joint rates and base twist for one step, how we read the paper. "held" holds the joint
             rates, as a perfect servo does, and moves the base exactly in between, by a sixth-order Magnus expansion:
             the truth for a sampled law. "rk4" is a fourth-order Lie-group Runge-Kutta method that calls the law within
-            the step too, and so integrates the law in continuous time.
+            the step too, and so integrates the law in continuous time. A `Dynamic` solves the equations of motion:
+            joints driven by torques, appendages that bend, a plant that differs from the model.
         arrival_tolerance: Distance, m, within which the end-effector has arrived.
         stop_early: End when the end-effector has arrived or has stalled instead of after `duration`.
         progress: Called now and then with the share done, 0 to 1.
+        smooth_start: Time, s, over which the law's pace rises from 0 to 1 as 10 x^3 - 15 x^4 + 6 x^5, so that rates and
+            accelerations start from zero without a jump. Held commands take the pace of the middle of their hold.
 
     Returns:
-        The motion. Coordinates `time` (s), `joint`, `axis`, `protected`; each variable has `units`, `frame` and
-        `long_name`. Variables: configuration, joint_positions, joint_rates, base_position, base_quaternion, base_rpy,
-        base_linear_velocity, base_angular_velocity, base_rotation_integral, protected_rate, protected_angle,
+        The motion. Coordinates `time` (s), `joint`, `axis`, `twist`, `protected`; each variable has `units`, `frame`
+        and `long_name`. Variables: configuration, joint_positions, joint_rates, base_position, base_quaternion,
+        base_rpy, base_linear_velocity, base_angular_velocity, base_twist_integral, protected_rate, protected_angle,
         end_effector_position, target_position, end_effector_error, smallest_singular_value, rate_scale, rate_blend,
         plan_change, damping, linear_momentum, angular_momentum, centre_of_mass, U_c, robot_urdf. Attributes: `outcome`
         ("converged", "stalled" or "running"), `outcome_time` (s), `final_error` (m), the law's settings, the method
-        and the versions.
+        and the versions. A dynamic motion has also joint_velocities, joint_torques, hinge_angles, tip_deflection,
+        kinetic_energy, spring_energy, drive_work, load_work, damping_loss, saturated_time, and the attributes
+        `physics`, `energy_error`, `momentum_drift` (both relative) and `largest_torques`.
 
     Raises:
         InputError: an argument makes no sense; the message names it.
+        SimulationDiverged: the numbers of a dynamic simulation run away; it carries the motion until then.
         SimulationInterrupted: Ctrl-C; it is a KeyboardInterrupt and carries the motion so far.
     """
     time = _sample_times(duration, dt)
-    if method not in STEPS:
-        raise InputError(f"method '{method}' is unknown: use {', '.join(STEPS)}")
+    if not isinstance(method, Dynamic) and method not in STEPS:
+        raise InputError(f"method '{method}' is unknown: use {', '.join(STEPS)} or a Dynamic")
     _refuse_unfit_method(law, method, duration, dt)
     if not (np.isfinite(arrival_tolerance) and arrival_tolerance > 0):
         raise InputError(f"arrival_tolerance is {arrival_tolerance}; it must be a positive distance, m")
-    robot = law.robot
-    start = robot.checked(q).copy()
-    reference = _reference(target)
-    _warn_out_of_reach(law, start, reference(0.0)[0])
+    pace, reference = _smooth_pace(smooth_start), _reference(target)
+    run = _Run(law, law.robot.checked(q).copy(), time, reference, pace, method)
+    _warn_out_of_reach(law, run.configurations[0], reference(0.0)[0])
+    run.settings = {"arrival_tolerance": arrival_tolerance, "smooth_start": float(smooth_start)}
+    tick = max(1, time.size // 100)
+    try:
+        for i in range(time.size):
+            run.step()
+            if i % tick == 0:
+                if progress is not None:
+                    progress(run.done / time.size)
+                # Slow on purpose is not stalled.
+                if stop_early and time[i] >= smooth_start and run.ended(arrival_tolerance):
+                    break
+    except KeyboardInterrupt:
+        if run.done == 0:
+            raise
+        raise SimulationInterrupted(run.record()) from None
+    except FloatingPointError as when:
+        raise SimulationDiverged(
+            f"the simulation has diverged at {when} s: the equations of motion run away or have no solution there; try "
+            "a shorter physics step or a softer servo",
+            run.record(),
+        ) from None
+    if progress is not None:
+        progress(1.0)
+    return run.record()
 
-    samples = time.size
-    configurations = np.empty((samples, robot.model.nq))
-    configurations[0] = start
-    turns = np.zeros((samples, 3))
-    targets = np.empty((samples, 3))
-    values = np.empty((samples, law.size))
-    step = STEPS[method]
-    rates = values[:, 6 : 6 + robot.n_joints]
-    at_rest = np.zeros(robot.n_joints)
-    error_column = slice(6 + robot.n_joints + kernel.ERROR, 6 + robot.n_joints + kernel.ERROR + 3)
-    time_constant = 1.0 / law.gain
-    tick = max(1, samples // 100)
-    done = 0
 
-    def record() -> xr.Dataset:
-        motion = build_motion(law, time[:done], configurations[:done], values[:done], turns[:done], targets[:done])
-        outcome = judge(time[:done], motion.end_effector_error.values, arrival_tolerance, time_constant)
+class _Run:
+    """A simulation on its way: what has been computed so far, and how to go on by one sample."""
+
+    def __init__(
+        self, law: SelectiveLaw, start: Floats, time: Floats, reference: Reference, pace: Pace, method: Method | Dynamic
+    ) -> None:
+        self.law, self.time, self.reference, self.pace, self.method = law, time, reference, pace, method
+        self.dynamic = DynamicMotion(method, law, start) if isinstance(method, Dynamic) else None
+        # A command that is held speaks for the middle of its hold, one of the continuous law for its own time.
+        holds = np.diff(time, append=2 * time[-1] - time[-2])
+        self.leads = np.zeros(time.size) if method == "rk4" else 0.5 * holds
+        samples, n = time.size, law.robot.n_joints
+        self.configurations = np.empty((samples, start.size))
+        self.configurations[0] = start
+        self.twists = np.zeros((samples, 6))
+        self.targets = np.empty((samples, 3))
+        self.values = np.empty((samples, law.size))
+        self.rates = self.values[:, 6 : 6 + n]
+        self.errors = self.values[:, 6 + n + kernel.ERROR : 9 + n + kernel.ERROR]
+        self.at_rest = np.zeros(n)
+        self.done = 0
+        self.settings: dict[str, float] = {}
+
+    def step(self) -> None:
+        """Move to the next sample and ask the law there."""
+        i, time = self.done, self.time
+        if i > 0:
+            self.configurations[i], moved = self._move(i)
+            self.twists[i] = self.twists[i - 1] + moved
+        self.targets[i], velocity = self.reference(time[i])
+        previous, pace = self.rates[i - 1] if i else self.at_rest, self.pace(time[i] + self.leads[i])
+        seen, wanted = self.configurations[i], None
+        if self.dynamic is not None:
+            self.dynamic.sample()
+            seen, wanted = self.dynamic.seen(), self.dynamic.correction()
+        self.law.evaluate(seen, self.targets[i], velocity, self.values[i], previous, wanted, pace)
+        self.done = i + 1
+
+    def _move(self, i: int) -> tuple[Floats, Floats]:
+        span = (self.time[i - 1], self.time[i])
+        if self.dynamic is not None:
+            return self.dynamic.move(self.rates[i - 1], *span)
+        step = STEPS[str(self.method)]
+        return step(self.law, self.reference, self.pace, self.configurations[i - 1], self.values[i - 1], *span)
+
+    def ended(self, tolerance: float) -> bool:
+        """Say whether the end-effector has arrived or has stalled."""
+        error = np.linalg.norm(self.errors[: self.done], axis=1)
+        return judge(self.time[: self.done], error, tolerance, 1.0 / self.law.gain).name != "running"
+
+    def record(self) -> xr.Dataset:
+        """Return the motion so far."""
+        law, done, time = self.law, self.done, self.time[: self.done]
+        motion = build_motion(
+            law, time, self.configurations[:done], self.values[:done], self.twists[:done], self.targets[:done]
+        )
+        if self.dynamic is not None:
+            motion = self.dynamic.complete(motion)
+        tolerance = self.settings["arrival_tolerance"]
+        outcome = judge(time, motion.end_effector_error.values, tolerance, 1.0 / law.gain)
         motion.attrs |= {
-            "method": method,
-            "arrival_tolerance": arrival_tolerance,
+            "method": "dynamic" if self.dynamic is not None else self.method,
+            **self.settings,
             "outcome": outcome.name,
             "outcome_time": outcome.time,
             "final_error": outcome.error,
         }
         return motion
 
-    try:
-        for i in range(samples):
-            if i > 0:
-                before = (configurations[i - 1], values[i - 1], time[i - 1], time[i])
-                configurations[i], turned = step(law, reference, *before)
-                turns[i] = turns[i - 1] + turned
-            targets[i], velocity = reference(time[i])
-            law.evaluate(configurations[i], targets[i], velocity, values[i], rates[i - 1] if i else at_rest)
-            done = i + 1
-            if progress is not None and i % tick == 0:
-                progress(done / samples)
-            if stop_early and i % tick == 0:
-                error = np.linalg.norm(values[:done, error_column], axis=1)
-                if judge(time[:done], error, arrival_tolerance, time_constant).name != "running":
-                    break
-    except KeyboardInterrupt:
-        if done == 0:
-            raise
-        raise SimulationInterrupted(record()) from None
-    if progress is not None:
-        progress(1.0)
-    return record()
 
-
-def _refuse_unfit_method(law: SelectiveLaw, method: str, duration: float, dt: float) -> None:
+def _refuse_unfit_method(law: SelectiveLaw, method: Method | Dynamic, duration: float, dt: float) -> None:
     if law.sample_time is not None and abs(law.sample_time - dt) > 1e-9 * dt:
         raise InputError(f"the law's sample_time is {law.sample_time:g} s, dt is {dt:g} s; they must be the same")
     if law.sample_time is not None and abs(duration / dt - round(duration / dt)) > 1e-9 * duration / dt:
         raise InputError(
             f"duration {duration:g} s is no whole number of steps of {dt:g} s, for each of which the law plans"
         )
-    if law.hold_nodes and method != "held":
+    if law.hold_nodes and method in ("explicit", "rk4"):
         raise InputError(
-            f"a law with hold_nodes plans for joint rates that are held: use method 'held', not '{method}'"
+            f"a law with hold_nodes plans for joint rates that are held: use method 'held' or a Dynamic, not '{method}'"
         )
     if law.acceleration_limits is not None and method == "rk4":
         raise InputError("acceleration limits hold from sample to sample: use method 'held' or 'explicit', not 'rk4'")
+
+
+def _smooth_pace(duration: float) -> Pace:
+    if not (np.isfinite(duration) and duration >= 0):
+        raise InputError(f"smooth_start is {duration}; it must be zero or a positive time, s")
+
+    def pace(time: float) -> float:
+        if time >= duration:
+            return 1.0
+        x = time / duration
+        return float(x**3 * (10.0 - 15.0 * x + 6.0 * x**2))
+
+    return pace
 
 
 def _sample_times(duration: float, dt: float) -> Floats:

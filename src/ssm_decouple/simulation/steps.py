@@ -1,6 +1,6 @@
 """From one sample to the next: how joints and base move under a command.
 
-Each step returns the next configuration and the integral of the base's angular velocity over the step, base axes.
+Each step returns the next configuration and the integral of the base twist (6,) over the step, base axes.
 """
 
 from __future__ import annotations
@@ -15,28 +15,29 @@ from ssm_decouple.control.law import GAUSS, SelectiveLaw
 
 Floats = NDArray[np.float64]
 Reference = Callable[[float], tuple[Floats, Floats]]  # time to target position and velocity
-Step = Callable[[SelectiveLaw, Reference, Floats, Floats, float, float], tuple[Floats, Floats]]
+Pace = Callable[[float], float]  # time to the share of the full pace
+Step = Callable[[SelectiveLaw, Reference, Pace, Floats, Floats, float, float], tuple[Floats, Floats]]
 
 _SQRT_15 = 15.0**0.5
 _JUDGE = [(0.5 + 0.5 * node, 0.5 * weight) for node, weight in zip(*np.polynomial.legendre.leggauss(5), strict=True)]
 
 
 def explicit(
-    law: SelectiveLaw, reference: Reference, q: Floats, values: Floats, t: float, t_next: float
+    law: SelectiveLaw, reference: Reference, pace: Pace, q: Floats, values: Floats, t: float, t_next: float
 ) -> tuple[Floats, Floats]:
     """Hold joint rates and base twist: one Euler step on SE(3), how we read the paper."""
     model, h = law.robot.model, t_next - t
-    return pin.integrate(model, q, h * values[: model.nv]), h * values[3:6]
+    return pin.integrate(model, q, h * values[: model.nv]), h * values[:6]
 
 
 def held(
-    law: SelectiveLaw, reference: Reference, q: Floats, values: Floats, t: float, t_next: float
+    law: SelectiveLaw, reference: Reference, pace: Pace, q: Floats, values: Floats, t: float, t_next: float
 ) -> tuple[Floats, Floats]:
     """Hold the joint rates; the base follows by a sixth-order Magnus expansion on three Gauss points.
 
     In base axes its twist depends on the joints alone, so the base pose at those points is not needed. The
     coefficients are those of Blanes, Casas and Ros; the brackets change sign because the twist stands on the right.
-    The integral of the angular velocity is taken on five points, more than any law plans with, so that it judges them.
+    The integral of the twist is taken on five points, more than any law plans with, so that it judges them.
     """
     model, h = law.robot.model, t_next - t
     rates = values[6 : model.nv]
@@ -51,12 +52,12 @@ def held(
     fourth = two.cross(one)
     fifth = one.cross(three * 2.0 + fourth) * (1 / 60)
     base = one + three * (1 / 12) + (two + fifth).cross(fourth - one * 20.0 - three) * (1 / 240)
-    turned = h * np.sum([weight * twist(node)[3:] for node, weight in _JUDGE], axis=0)
-    return pin.integrate(model, q, np.r_[base.vector, h * rates]), turned
+    moved = h * np.sum([weight * twist(node) for node, weight in _JUDGE], axis=0)
+    return pin.integrate(model, q, np.r_[base.vector, h * rates]), moved
 
 
 def runge_kutta(
-    law: SelectiveLaw, reference: Reference, q: Floats, values: Floats, t: float, t_next: float
+    law: SelectiveLaw, reference: Reference, pace: Pace, q: Floats, values: Floats, t: float, t_next: float
 ) -> tuple[Floats, Floats]:
     """Classical fourth order in the coordinates u = difference(q, .) about the step's start (Munthe-Kaas).
 
@@ -67,15 +68,15 @@ def runge_kutta(
 
     def slope(u: Floats, time: float) -> tuple[Floats, Floats]:
         stage = pin.integrate(model, q, u)
-        law.evaluate(stage, *reference(time), buffer)
-        return pin.dDifference(model, q, stage, pin.ARG1) @ buffer[: model.nv], buffer[3:6].copy()
+        law.evaluate(stage, *reference(time), buffer, pace=pace(time))
+        return pin.dDifference(model, q, stage, pin.ARG1) @ buffer[: model.nv], buffer[:6].copy()
 
-    u1, w1 = values[: model.nv], values[3:6]
-    u2, w2 = slope(0.5 * h * u1, t + 0.5 * h)
-    u3, w3 = slope(0.5 * h * u2, t + 0.5 * h)
-    u4, w4 = slope(h * u3, t + h)
-    turned = (h / 6.0) * (w1 + 2.0 * w2 + 2.0 * w3 + w4)
-    return pin.integrate(model, q, (h / 6.0) * (u1 + 2.0 * u2 + 2.0 * u3 + u4)), turned
+    u1, t1 = values[: model.nv], values[:6]
+    u2, t2 = slope(0.5 * h * u1, t + 0.5 * h)
+    u3, t3 = slope(0.5 * h * u2, t + 0.5 * h)
+    u4, t4 = slope(h * u3, t + h)
+    moved = (h / 6.0) * (t1 + 2.0 * t2 + 2.0 * t3 + t4)
+    return pin.integrate(model, q, (h / 6.0) * (u1 + 2.0 * u2 + 2.0 * u3 + u4)), moved
 
 
 STEPS: dict[str, Step] = {"explicit": explicit, "held": held, "rk4": runge_kutta}

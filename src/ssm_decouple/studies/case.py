@@ -6,7 +6,7 @@ import difflib
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from ssm_decouple.errors import DecoupleError, InputError, as_floats
 from ssm_decouple.model.catalogue import load_robot, models
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.simulation.dynamic import Dynamic, Servo
 from ssm_decouple.simulation.simulate import Progress, simulate
 from ssm_decouple.simulation.steps import STEPS
 
@@ -67,9 +68,19 @@ _SCHEMA: dict[str, dict[str, tuple[str, bool]]] = {
         "dt": (_NUMBER, True),
         "method": (_TEXT, False),
         "arrival_tolerance": (_NUMBER, False),
+        "smooth_start": (_NUMBER, False),
     },
-    "figure": {"turned_deg": (_TURNS, False)},
+    "dynamic": {
+        "step": (_NUMBER, False),
+        "drives": (_TEXT, False),
+        "servo_frequency": (_NUMBER, False),
+        "servo_damping_ratio": (_NUMBER, False),
+        "servo_period": (_NUMBER, False),
+        "feedback_gain": (_NUMBER, False),
+    },
+    "spacecraft": {"turned_deg": (_TURNS, False)},
 }
+DRIVES = ("torque", "prescribed")
 
 
 @dataclass(frozen=True)
@@ -90,8 +101,9 @@ class Case:
             acceleration_limit. The law's sample time is `dt`.
         duration: s.
         dt: Time between samples, s.
-        simulation: Further arguments of `simulate`: method, arrival_tolerance.
-        turned: Visuals of the root link that the figures show turned about its y axis, rad by name.
+        simulation: Further arguments of `simulate`: method, arrival_tolerance, smooth_start.
+        turned: What of the root link stands turned about its y axis, rad by name: visuals, which the figures show so,
+            and appendages, which bend so.
     """
 
     name: str
@@ -111,8 +123,14 @@ class Case:
 
     @cached_property
     def robot(self) -> Robot:
-        """The robot, loaded when first asked for."""
-        return load_robot(self.robot_source, self.end_effector)
+        """The robot, loaded when first asked for, its appendages turned as the case has them."""
+        robot = load_robot(self.robot_source, self.end_effector)
+        turned = []
+        for appendage in robot.appendages:
+            R = pin.rpy.rpyToMatrix(0.0, self.turned.get(appendage.name, 0.0), 0.0)
+            directions = {name: R @ getattr(appendage, name) for name in ("span_direction", "normal")}
+            turned.append(replace(appendage, **directions))
+        return robot.with_appendages(turned) if turned else robot
 
     def start(self) -> Floats:
         """Return the start configuration (nq,)."""
@@ -152,7 +170,7 @@ class Case:
         motion.attrs |= {
             "case": self.name,
             "title": self.title,
-            "case_U_c": json.dumps(self.protection.U_c.tolist()),
+            "case_U_c": json.dumps(self.protection.U_twist.tolist()),
             "case_frame": self.protection.frame,
             "turned": json.dumps(dict(self.turned)),
         }
@@ -221,11 +239,29 @@ def _case(content: dict[str, Any], path: Path) -> Case:
         law=law_arguments,
         duration=float(simulation["duration"]),
         dt=float(simulation["dt"]),
-        simulation={key: simulation[key] for key in ("method", "arrival_tolerance") if key in simulation},
+        simulation={key: value for key, value in simulation.items() if key not in ("duration", "dt")}
+        | _physics(content),
         turned={
-            name: float(np.deg2rad(angle)) for name, angle in content.get("figure", {}).get("turned_deg", {}).items()
+            name: float(np.deg2rad(angle))
+            for name, angle in content.get("spacecraft", {}).get("turned_deg", {}).items()
         },
     )
+
+
+def _physics(content: Mapping[str, Any]) -> dict[str, Dynamic]:
+    """Return the method of a dynamic case; nothing of another."""
+    given = dict(content.get("dynamic", {}))
+    if content["simulation"].get("method") != "dynamic":
+        if given:
+            raise InputError('[dynamic] is only read where [simulation] has method = "dynamic"')
+        return {}
+    drives = given.pop("drives", "torque")
+    if drives not in DRIVES:
+        raise InputError(f"[dynamic] {_unknown('drives', drives, list(DRIVES))}")
+    servo = {key.removeprefix("servo_"): given.pop(key) for key in list(given) if key.startswith("servo_")}
+    if drives == "prescribed" and servo:
+        raise InputError('[dynamic] drives = "prescribed" has no servo: its joints follow the commands at once')
+    return {"method": Dynamic(servo=Servo(**servo) if drives == "torque" else None, **given)}
 
 
 def _joints(start: Mapping[str, Any]) -> Floats | dict[str, float] | None:
@@ -246,8 +282,9 @@ def _joints(start: Mapping[str, Any]) -> Floats | dict[str, float] | None:
 def _directions(axes: list[Any]) -> Floats:
     """Turn a case file's directions, one in a row, into the columns of U_c."""
     rows = axes if axes and all(isinstance(row, list) for row in axes) else [axes]
-    if any(len(row) != 3 or any(isinstance(x, list) for x in row) for row in rows):
-        raise InputError(f"[protection] axes {axes}: each direction needs 3 numbers")
+    flat = not any(isinstance(x, list) for row in rows for x in row)
+    if not flat or {len(row) for row in rows} not in ({3}, {6}):
+        raise InputError(f"[protection] axes {axes}: each direction needs 3 numbers, or each 6 for the whole twist")
     return as_floats("[protection] axes", rows).T
 
 
@@ -270,8 +307,8 @@ def _validate(content: dict[str, Any]) -> None:
         if missing:
             raise InputError(f"{place}{missing[0]} is missing")
     method = content["simulation"].get("method", "explicit")
-    if method not in STEPS:
-        raise InputError(f"[simulation] {_unknown('method', method, list(STEPS))}")
+    if method not in (*STEPS, "dynamic"):
+        raise InputError(f"[simulation] {_unknown('method', method, [*STEPS, 'dynamic'])}")
 
 
 def _unknown(kind: str, word: str, known: list[str]) -> str:

@@ -14,7 +14,7 @@ import xarray as xr
 
 from ssm_decouple.files import written_whole
 from ssm_decouple.momentum.protection import Protection
-from ssm_decouple.simulation.motion import rotation_about
+from ssm_decouple.simulation.motion import protected_integral
 from ssm_decouple.studies.case import Case
 
 LAWS = ("none", "selective", "reactionless")
@@ -35,7 +35,8 @@ class Summary:
         start_distance_m: End-effector to target at the start.
         final_error_m: The same at the end.
         final_position_m: Where the end-effector is at the end, inertial axes.
-        w_sub_max_rad_s: Largest base angular velocity about any of the case's protected directions.
+        w_sub_max_rad_s: Largest base angular velocity about any of the case's protected directions. Where those are of
+            the whole twist, the largest rate along any of them: m counts as rad, here and in what follows.
         protected_angle_deg: Largest rotation from the start about any of them, summed over the samples.
         roll_deg: Base roll, peak to peak.
         pitch_deg: Base pitch, peak to peak.
@@ -114,19 +115,24 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
 
 
 def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Return rate (m, k), rad/s, and angle (m, k), rad, about the directions that the motion's case protects.
+    """Return rate (m, k), rad/s, and angle (m, k), rad, along the directions that the motion's case protects.
+
+    Directions of the whole base twist mix m with rad.
 
     Under the case's own protection these are the motion's protected_rate and protected_angle; under another they say
     what the same directions suffer.
     """
-    U_c, frame = np.array(json.loads(motion.attrs["case_U_c"])).reshape(3, -1), motion.attrs["case_frame"]
+    U_c, frame = np.array(json.loads(motion.attrs["case_U_c"])).reshape(6, -1), motion.attrs["case_frame"]
     if np.array_equal(U_c, motion.U_c.values) and frame == json.loads(motion.attrs["law"])["frame"]:
         return motion.protected_rate.values, motion.protected_angle.values
     from scipy.spatial.transform import Rotation
 
-    omega, quaternions = motion.base_angular_velocity.values, motion.base_quaternion.values
-    rate = (omega if frame == "base" else Rotation.from_quat(quaternions).apply(omega)) @ U_c
-    return rate, rotation_about(U_c, frame, motion.base_rotation_integral.values, quaternions)
+    twist = [motion.base_linear_velocity.values, motion.base_angular_velocity.values]
+    if frame == "inertial":
+        attitude = Rotation.from_quat(motion.base_quaternion.values)
+        twist = [attitude.apply(part) for part in twist]
+    angle = protected_integral(U_c, frame, motion.base_twist_integral.values, motion.configuration.values)
+    return np.hstack(twist) @ U_c, angle
 
 
 @dataclass(frozen=True)
@@ -152,7 +158,7 @@ def laws_of(case: Case) -> dict[str, Protection]:
     chosen = {"none": Protection("none"), "selective": case.protection, "reactionless": Protection("all")}
     if case.protection.k == 0:
         del chosen["selective"]
-    if case.protection.k == 3:
+    if case.protection.k == 3 and not np.any(case.protection.U_twist[:3]):
         del chosen["reactionless"]
     return chosen
 

@@ -21,7 +21,8 @@ class Drift:
         case: Name of the case.
         hold_nodes: How the law plans for the hold; 0 is the paper's projection at the sample.
         sample_time_s: Time between samples.
-        drift_deg: Largest true rotation about a protected axis over the motion, in magnitude.
+        drift_deg: Largest true rotation about a protected axis over the motion, in magnitude; m counts as rad where
+            the protection is of the whole twist.
         order: Order at which the drift shrinks with the sample time, against the next longer one; None for the longest
             and where the drift is rounding.
         final_error_m: Distance to the target at the end.

@@ -11,11 +11,28 @@ import numpy as np
 import xarray as xr
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from numpy.typing import NDArray
 
+from ssm_decouple.studies.bending import parts_of
+from ssm_decouple.studies.case import Case
 from ssm_decouple.studies.comparison import disturbance
+from ssm_decouple.studies.pointing import ARCSEC, pointing_error
+from ssm_decouple.studies.robustness import Leak
 from ssm_decouple.studies.sampling import PLANS, Drift
 from ssm_decouple.viewing.spacecraft import draw_configurations
-from ssm_decouple.viewing.style import AXIS_COLORS, LAW_LINES, PAGE, PROTECTED, joint_colors, panels, save, styled
+from ssm_decouple.viewing.style import (
+    AXIS_COLORS,
+    COLUMN,
+    LAW_LINES,
+    PAGE,
+    PROTECTED,
+    joint_colors,
+    panels,
+    save,
+    styled,
+)
+
+Floats = NDArray[np.float64]
 
 FLOOR = 1e-21  # rad/s: zero on a logarithmic axis
 
@@ -59,25 +76,27 @@ def base(motion: xr.Dataset) -> Figure:
 
 @styled
 def protected_rate(motion: xr.Dataset) -> Figure:
-    """Draw the constrained disturbance angular velocity."""
+    """Draw the constrained disturbance angular velocity, or twist where the protection has linear parts."""
     figure, (axes,) = panels(1, height=1.9)
     rates = motion.protected_rate.values
     exponent = int(np.floor(np.log10(np.abs(rates).max(initial=0.0)))) if np.any(rates) else 0
+    linear = bool(np.any(motion.U_c.values[:3]))
     for i in range(rates.shape[1]):
-        column = ", ".join(f"{value:.3g}" for value in motion.U_c.values[:, i] + 0.0)
+        column = ", ".join(f"{value:.3g}" for value in motion.U_c.values[0 if linear else 3 :, i] + 0.0)
         axes.plot(
             motion.time,
             rates[:, i] / 10.0**exponent,
-            color=(PROTECTED, "#0072B2", "#E69F00")[i],
+            color=(PROTECTED, "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9")[i],
             linewidth=0.6,
-            label=f"about ({column})",
+            label=f"{'along' if linear else 'about'} ({column})",
         )
     if rates.shape[1]:
         axes.legend(loc="upper right")
     else:
         axes.text(0.5, 0.5, "nothing is protected", transform=axes.transAxes, ha="center")
+    unit = "m/s, rad/s" if linear else "rad/s"
     axes.set_ylabel(
-        rf"$\omega_\mathrm{{sub}}$ ($10^{{{exponent}}}$ rad/s)" if exponent else r"$\omega_\mathrm{sub}$ (rad/s)"
+        rf"$\omega_\mathrm{{sub}}$ ($10^{{{exponent}}}$ {unit})" if exponent else rf"$\omega_\mathrm{{sub}}$ ({unit})"
     )
     return _with_time(motion, figure, axes)
 
@@ -109,7 +128,10 @@ def comparison(motions: Mapping[str, xr.Dataset]) -> Figure:
     distance, disturbed, singular, *angles = axes
     thresholds = set()
     first = next(iter(motions.values()))
-    one = len(json.loads(first.attrs["case_U_c"])[0]) == 1
+    U_c = np.array(json.loads(first.attrs["case_U_c"]))
+    about, unit = "about the protected axis" if U_c.shape[1] == 1 else "about the protected axes", "rad/s"
+    if np.any(U_c[:3]):
+        about, unit = "along the protected directions", "m/s, rad/s"
     for law, motion in motions.items():
         # The law in question lies on top, where the others would hide it.
         line: dict[str, Any] = {**LAW_LINES.get(law, {}), "label": law, "zorder": 3 if law == "selective" else 2}
@@ -135,8 +157,8 @@ def comparison(motions: Mapping[str, xr.Dataset]) -> Figure:
         )
     distance.set(title="distance to target", ylabel="mm")
     disturbed.set(
-        title="rate about the protected axis" if one else "rate about the protected axes",
-        ylabel=r"$|\omega_\mathrm{sub}|$ (rad/s)",
+        title=f"rate {about}",
+        ylabel=rf"$|\omega_\mathrm{{sub}}|$ ({unit})",
         ylim=(FLOOR / 3, 1e-1),
     )
     singular.set(title=r"smallest $\sigma$ of $J_{g,t} N_\mathrm{sub}$", ylabel="m")
@@ -169,6 +191,81 @@ def sampling(rows: Sequence[Drift]) -> Figure:
         axis.set_xticks([], minor=True)
     axes[0].set_ylabel("rotation about the\nprotected axes (deg)")
     figure.legend(*axes[0].get_legend_handles_labels(), ncols=len(PLANS), loc="outside lower center")
+    return figure
+
+
+@styled
+def bending(subject: tuple[Case, Mapping[str, xr.Dataset]]) -> Figure:
+    """Draw how the appendages of a case bend under several protections: `subject` is the case and its motions."""
+    case, motions = subject
+    first = next(iter(motions.values()))
+    names = [str(name).replace("_", " ") for name in first.appendage.values]
+    two = parts_of(case, np.zeros((1, len(names))))[0] is not None
+    titles = ["symmetric: driven by translation", "antisymmetric: driven by rotation"] if two else names
+    figure, axes = panels(2, len(titles), width=PAGE, height=1.95)
+    for law, motion in motions.items():
+        tips = 1e3 * motion.tip_deflection.values
+        parts = parts_of(case, tips) if two else tuple(tips.T)
+        for i, part in enumerate(parts):
+            values = np.asarray(part)
+            line: dict[str, Any] = {**LAW_LINES.get(law, {}), "label": law, "linewidth": 0.7}
+            axes[i].plot(motion.time, values, **line)
+            axes[len(titles) + i].semilogy(motion.time, np.maximum(_envelope(motion.time.values, values), 1e-6), **line)
+    for i, title in enumerate(titles):
+        axes[i].set_title(title)
+        axes[len(titles) + i].set_xlabel("time (s)")
+    axes[0].set_ylabel("tip deflection (mm)")
+    axes[len(titles)].set_ylabel("its envelope (mm)")
+    figure.suptitle(first.attrs["title"], fontsize=9)
+    figure.legend(*axes[0].get_legend_handles_labels(), ncols=len(motions), loc="outside lower center")
+    axes[0].set_xlim(0, float(first.time[-1]))
+    return figure
+
+
+def _envelope(time: Floats, values: Floats, window: float = 7.0) -> Floats:
+    """Return the largest magnitude within half a window, s, of each sample: about a period of a slow appendage."""
+    half = max(1, round(0.5 * window / float(time[1] - time[0])))
+    padded = np.pad(np.abs(values), half, mode="edge")
+    return np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).max(axis=1)
+
+
+@styled
+def pointing(motions: Mapping[str, xr.Dataset]) -> Figure:
+    """Draw how a line of sight wanders under several laws, over the distance to the target."""
+    figure, (top, bottom) = panels(2, width=COLUMN, height=1.9)
+    first = next(iter(motions.values()))
+    for law, motion in motions.items():
+        line: dict[str, Any] = {**LAW_LINES.get(law, {}), "label": law, "linewidth": 0.9}
+        wander = ARCSEC * pointing_error(motion, motion.attrs["boresight"])
+        top.semilogy(motion.time[1:], np.maximum(wander[1:], 1e-5), **line)
+        bottom.semilogy(motion.time, 1e3 * motion.end_effector_error, **line)
+    top.set_ylabel("pointing error (arcsec)")
+    bottom.set_ylabel("distance to target (mm)")
+    figure.legend(*top.get_legend_handles_labels(), ncols=2, loc="outside upper center")
+    return _with_time(first, figure, bottom)
+
+
+@styled
+def robustness(rows: Sequence[Leak]) -> Figure:
+    """Draw the leak into the protected axes against the error of the model, a panel a case."""
+    names = list(dict.fromkeys(row.case for row in rows))
+    figure, axes = panels(1, len(names), width=PAGE if len(names) > 1 else COLUMN, height=2.3)
+    for axis, name in zip(axes, names, strict=True):
+        mine = [row for row in rows if row.case == name]
+        for gain, color in zip(sorted({row.feedback_gain for row in mine}), (PROTECTED, "#0072B2"), strict=False):
+            line = sorted((row for row in mine if row.feedback_gain == gain), key=lambda row: row.level)
+            levels = [100 * row.level for row in line]
+            label = f"feedback, {gain:g} 1/s" if gain else "no feedback"
+            axis.loglog(levels, [row.median_deg for row in line], color=color, marker="o", markersize=3, label=label)
+            axis.fill_between(
+                levels, [row.low_deg for row in line], [row.high_deg for row in line], color=color, alpha=0.2, lw=0
+            )
+            axis.set_xticks(levels, [f"{level:g}" for level in levels])
+            axis.set_xticks([], minor=True)
+        axis.axhline(mine[0].unprotected_deg, color="#8C8C8C", linestyle="--", label="nothing protected")
+        axis.set(title=name, xlabel="error of the model (%)")
+    axes[0].set_ylabel("rotation about the\nprotected axes (deg)")
+    figure.legend(*axes[0].get_legend_handles_labels(), ncols=3, loc="outside lower center")
     return figure
 
 

@@ -75,7 +75,9 @@ def _draw_motion(axes: Axes3D, motion: xr.Dataset, robot: Robot, q: Floats) -> N
     axes.plot(*path.T, color="#D55E00", linewidth=1.0, label="end-effector path", zorder=4)
     axes.plot(*target[:, None], color=TARGET, marker="*", markersize=6, linestyle="none", label="target", zorder=5)
     pose = robot.base_pose(q)
-    directions = motion.U_c.values
+    U_c = motion.U_c.values
+    # A line is an axis of rotation; a direction with a linear part is none.
+    directions = U_c[3:, ~np.any(U_c[:3], axis=0)]
     if json.loads(motion.attrs["law"])["frame"] == "base":
         directions = pose.rotation @ directions
     for i, direction in enumerate(directions.T):

@@ -30,6 +30,13 @@ LAW_LINES: dict[str, dict[str, Any]] = {
     "reactionless, undamped": {"color": "#E69F00", "linestyle": (0, (1, 1.5))},
     "selective, undamped": {"color": "#CC79A7", "linestyle": (0, (1, 1.5))},
 }
+LAW_LINES |= {
+    "selective, planned": {"color": "#CC79A7", "linestyle": (0, (4, 1))},
+    "reactionless, planned": {"color": "#E69F00", "linestyle": (0, (4, 1))},
+    "the case's own": LAW_LINES["selective"],
+    "bending modes": {"color": "#0072B2", "linestyle": "-"},
+    "all rotation": LAW_LINES["reactionless"],
+}
 
 _STYLE: Any = {
     "font.size": 8,

@@ -8,7 +8,10 @@ import numpy as np
 from rich import box
 from rich.table import Table
 
+from ssm_decouple.studies.bending import Bending
 from ssm_decouple.studies.comparison import UNDAMPED, Summary
+from ssm_decouple.studies.pointing import Pointing
+from ssm_decouple.studies.robustness import Effect, Leak, slope
 from ssm_decouple.studies.sampling import PLANS, Drift
 
 HEADINGS = ("case", "law", "k", "outcome", "left (mm)", "|w_sub| (rad/s)", "roll, pitch, yaw (deg)", "sigma (m)")
@@ -61,6 +64,75 @@ def drift_table(rows: Sequence[Drift]) -> list[list[str]]:
         known = [order for order in orders if order is not None]
         lines.append([case, PLANS[nodes], *cells_, f"{np.median(known):.1f}" if known else "rounding"])
     return lines
+
+
+def bending_table(rows: Sequence[Bending]) -> list[list[str]]:
+    """Return how appendages bend as rows of texts, headings first."""
+    head = ["case", "protected", "rows", "tip, peak (mm)", "symmetric", "antisymmetric", "outcome", "left (mm)"]
+    return [head] + [
+        [
+            row.case,
+            row.protection,
+            str(row.k),
+            f"{row.peak_mm:.4f}",
+            "" if row.symmetric_mm is None else f"{row.symmetric_mm:.4f}",
+            "" if row.antisymmetric_mm is None else f"{row.antisymmetric_mm:.4f}",
+            f"{row.outcome}, {row.outcome_time_s:.0f} s",
+            f"{1e3 * row.final_error_m:.1f}",
+        ]
+        for row in rows
+    ]
+
+
+def pointing_table(rows: Sequence[Pointing]) -> list[list[str]]:
+    """Return how a line of sight wanders as rows of texts, headings first."""
+    head = ["case", "law", "k", "peak (arcsec)", "rms (arcsec)", "at the end", "outcome", "left (mm)"]
+    return [head] + [
+        [
+            row.case,
+            row.law,
+            str(row.k),
+            f"{row.peak_arcsec:.4f}",
+            f"{row.rms_arcsec:.4f}",
+            f"{row.end_arcsec:.4f}",
+            f"{row.outcome}, {row.outcome_time_s:.0f} s",
+            f"{1e3 * row.final_error_m:.1f}",
+        ]
+        for row in rows
+    ]
+
+
+def leak_table(rows: Sequence[Leak]) -> list[list[str]]:
+    """Return what errors in the model leave of the protection as rows of texts, headings first."""
+    head = ["case", "feedback", "error (%)", "runs", "median (deg)", "95 % band (deg)", "gain, median", "gain, worst"]
+    head += ["arrived (%)", "slope"]
+    lines = [head]
+    for row in sorted(rows, key=lambda row: (row.case, row.feedback_gain, row.level)):
+        grows = slope([other for other in rows if (other.case, other.feedback_gain) == (row.case, row.feedback_gain)])
+        lines.append(
+            [
+                row.case,
+                f"{row.feedback_gain:g} /s" if row.feedback_gain else "none",
+                f"{100 * row.level:g}",
+                str(row.runs),
+                f"{row.median_deg:.1e}",
+                f"{row.low_deg:.1e} to {row.high_deg:.1e}",
+                f"{row.gain_median:.0f}",
+                f"{row.gain_worst:.0f}",
+                f"{100 * row.arrived:.0f}",
+                "" if grows is None else f"{grows:.2f}",
+            ]
+        )
+    return lines
+
+
+def effect_table(rows: Sequence[Effect]) -> list[list[str]]:
+    """Return what single imperfections do as rows of texts, headings first."""
+    head = ["case", "imperfect", "without feedback (deg)", "with feedback (deg)", "left (mm)"]
+    return [head] + [
+        [row.case, row.cause, f"{row.without_deg:.1e}", f"{row.with_deg:.1e}", f"{1e3 * row.final_error_m:.1f}"]
+        for row in rows
+    ]
 
 
 def markdown(lines: Sequence[Sequence[str]]) -> str:

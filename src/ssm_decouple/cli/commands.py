@@ -1,10 +1,9 @@
-"""The command `ssm-decouple`."""
+"""The commands that run and compare cases, draw motions and look at robots."""
 
 from __future__ import annotations
 
 import dataclasses
 import json
-import re
 import sys
 import warnings
 from collections.abc import Iterator
@@ -14,21 +13,31 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
 import ssm_decouple
-from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError
+from ssm_decouple.cli.shared import (
+    INTERRUPTED,
+    NOT_ARRIVED,
+    AsJson,
+    Cases,
+    NoFigures,
+    NoProgress,
+    Output,
+    complain,
+    escape_markup,
+    file_name,
+    load,
+    print_table,
+    progress_bar,
+)
+from ssm_decouple.cli.study import study
+from ssm_decouple.errors import DecoupleError, DecoupleWarning
 
 if TYPE_CHECKING:
     import xarray as xr
-    from rich.table import Table
 
     from ssm_decouple.studies.case import Case
     from ssm_decouple.studies.comparison import Summary
-
-NOT_ARRIVED = 3
-INTERRUPTED = 130
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -42,24 +51,20 @@ app = typer.Typer(
     f"{NOT_ARRIVED} a motion of 'run' did not reach its target; {INTERRUPTED} interrupted, what was done is kept.",
 )
 
-study = typer.Typer(no_args_is_help=True, help="Parameter studies of cases.")
 app.add_typer(study, name="study")
 
-_CASES = "Names of cases ('ssm-decouple cases' lists them), TOML files, or 'all'."
 _PROTECT = (
     "Protect this instead of the case's own axes: none, roll, pitch, yaw, all, several as 'roll+yaw', or numbers as "
     "'0.5,0,0.866' or '1,0,0;0,0,1'; add '@inertial' for inertial axes."
 )
-Cases = Annotated[list[str], typer.Argument(help=_CASES, show_default=False)]
-Output = Annotated[Path, typer.Option("--output", "-o", help="Folder for what is written.")]
+Dynamics = Annotated[
+    bool, typer.Option("--dynamic", help="Solve the equations of motion, the joints driven by torques.")
+]
 TimeStep = Annotated[float | None, typer.Option("--dt", help="Time between samples, s, instead of the case's own.")]
 Protect = Annotated[str | None, typer.Option("--protect", "-p", help=_PROTECT)]
 Damping = Annotated[
     float | None, typer.Option(help="rho at a singularity, m2, instead of the case's own; 0 for the plain inverse.")
 ]
-NoFigures = Annotated[bool, typer.Option("--no-figures", help="Write no figures.")]
-NoProgress = Annotated[bool, typer.Option("--no-progress", help="Show no progress.")]
-AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to standard output instead of tables.")]
 
 
 def main() -> None:
@@ -68,7 +73,7 @@ def main() -> None:
     try:
         app()
     except DecoupleError as error:
-        _complain(f"[bold red]error:[/] {_escape(error)}")
+        complain(f"[bold red]error:[/] {escape_markup(error)}")
         sys.exit(1)
 
 
@@ -86,6 +91,7 @@ def run(
     dt: TimeStep = None,
     protect: Protect = None,
     damping: Damping = None,
+    dynamic: Dynamics = False,
     no_figures: NoFigures = False,
     no_progress: NoProgress = False,
     as_json: AsJson = False,
@@ -104,8 +110,8 @@ def run(
         law = {"none": "none", "all": "reactionless"}.get(protect, f"protect {protect}")
         chosen = Protection.parse(protect)
     work = _Work(output, no_figures, as_json)
-    with work.collecting(), _progress(no_progress or as_json) as show:
-        for case in _load(cases, damping):
+    with work.collecting(), progress_bar(no_progress or as_json) as show:
+        for case in load(cases, damping, dynamic):
             if protect is not None:  # it becomes the case's own, so that w_sub is about these axes
                 case = dataclasses.replace(case, protection=chosen)
             motion = case.run(dt=dt, progress=partial(show, case.name, law))
@@ -123,6 +129,7 @@ def compare(
     output: Output = Path("results"),
     dt: TimeStep = None,
     damping: Damping = None,
+    dynamic: Dynamics = False,
     no_figures: NoFigures = False,
     no_progress: NoProgress = False,
     as_json: AsJson = False,
@@ -137,8 +144,8 @@ def compare(
     from ssm_decouple.studies.comparison import compare_step_by_step, summarise, write_csv
 
     work = _Work(output, no_figures, as_json)
-    with work.collecting(), _progress(no_progress or as_json) as show:
-        for case in _load(cases, damping):
+    with work.collecting(), progress_bar(no_progress or as_json) as show:
+        for case in load(cases, damping, dynamic):
             motions = {}
             for law, motion in compare_step_by_step(case, dt, partial(show, case.name)):
                 motions[law] = motion
@@ -151,52 +158,6 @@ def compare(
     if work.rows:
         work.files.append(write_csv(work.rows, work.folder / "comparison.csv"))
     work.report()
-
-
-@study.command("sampling")
-def study_sampling(
-    cases: Cases,
-    output: Output = Path("results"),
-    no_figures: NoFigures = False,
-    no_progress: NoProgress = False,
-    as_json: AsJson = False,
-) -> None:
-    """How far the protected axis really turns when commands are held between samples.
-
-    Each case under four ways of planning for the hold and five sample times. Writes OUTPUT/sampling.csv and a figure.
-
-    Example: ssm-decouple study sampling case1 case2 case3
-    """
-    from ssm_decouple.files import writable_folder
-    from ssm_decouple.studies.comparison import write_csv
-    from ssm_decouple.studies.sampling import PLANS, sampling
-    from ssm_decouple.viewing import figures, style
-    from ssm_decouple.viewing.table import drift_table, plain
-
-    folder, rows, interrupted = writable_folder(output), [], False
-    with _progress(no_progress or as_json) as show:
-
-        def tick(case: str, nodes: int, dt: float, share: float) -> None:
-            show(case, f"{PLANS[nodes]}, {dt:g} s", share)
-
-        try:
-            for case in _load(cases, None):
-                rows += list(sampling(case, progress=partial(tick, case.name)))
-        except KeyboardInterrupt:
-            interrupted = True
-    files = [write_csv(rows, folder / "sampling.csv")] if rows else []
-    if rows and not no_figures:
-        files += style.save(figures.sampling(rows), folder, "sampling")
-    if as_json:
-        shown = {"interrupted": interrupted, "rows": [dataclasses.asdict(row) for row in rows]}
-        typer.echo(json.dumps(shown | {"files": [str(path) for path in files]}, indent=2))
-    elif rows:
-        typer.echo("largest true rotation about a protected axis over the motion, deg")
-        _print_table(plain(drift_table(rows)))
-        typer.echo(f"{len(files)} files in {folder}")
-    if interrupted:
-        _complain("[bold yellow]interrupted:[/] the cases finished before are kept")
-        raise typer.Exit(INTERRUPTED)
 
 
 @app.command()
@@ -216,17 +177,17 @@ def plot(
 
 @app.command()
 def check(
-    robot: Annotated[str, typer.Argument(help="A URDF file, or the name of a robot of the catalogue.")],
+    robot: Annotated[str, typer.Argument(help="A URDF or TOML file, or the name of a robot of the catalogue.")],
     as_json: AsJson = False,
 ) -> None:
     """Say what a robot is made of and what is suspicious or impossible in its URDF.
 
     Exit status 1 if it cannot be used.
     """
-    from ssm_decouple.model.catalogue import find_urdf
+    from ssm_decouple.model.catalogue import find_robot
     from ssm_decouple.model.report import Report
 
-    report = Report.of_file(find_urdf(robot))
+    report = Report.of_file(find_robot(robot))
     typer.echo(json.dumps(report.to_dict(), indent=2) if as_json else str(report))
     if not report.usable:
         raise typer.Exit(1)
@@ -235,17 +196,26 @@ def check(
 @app.command()
 def models(as_json: AsJson = False) -> None:
     """List the robots that come with the package."""
-    from ssm_decouple.model.catalogue import load_robot
+    from ssm_decouple.model.catalogue import find_urdf, load_robot
     from ssm_decouple.model.catalogue import models as catalogue
 
     paths = catalogue()
     robots = {name: load_robot(name) for name in paths}
     if as_json:
-        listed = {name: {"joints": r.n_joints, "mass": r.mass, "urdf": str(paths[name])} for name, r in robots.items()}
+        listed = {
+            name: {
+                "joints": found.n_joints,
+                "mass": found.mass,
+                "urdf": str(find_urdf(name)),
+                "appendages": [appendage.name for appendage in found.appendages],
+            }
+            for name, found in robots.items()
+        }
         typer.echo(json.dumps(listed, indent=2))
         return
     for name, found in robots.items():
-        typer.echo(f"{name:<16} {found.n_joints} joints  {found.mass:7.1f} kg  {paths[name]}")
+        bends = f"{len(found.appendages)} appendages" if found.appendages else ""
+        typer.echo(f"{name:<16} {found.n_joints} joints  {found.mass:7.1f} kg  {bends:<12}  {paths[name]}")
 
 
 @app.command()
@@ -261,19 +231,6 @@ def cases(as_json: AsJson = False) -> None:
         return
     for name, path in catalogue().items():
         typer.echo(f"{name:<13} {titles[name]}\n{'':<13} {path}")
-
-
-def _load(names: list[str], damping: float | None) -> list[Case]:
-    from ssm_decouple.studies.case import cases as catalogue
-    from ssm_decouple.studies.case import load_case
-
-    loaded = [load_case(name) for word in names for name in (catalogue() if word == "all" else [word])]
-    twice = {case.name for case in loaded if [other.name for other in loaded].count(case.name) > 1}
-    if twice:
-        raise InputError(f"two cases are called {', '.join(sorted(twice))}: their results would overwrite each other")
-    if damping is None:
-        return loaded
-    return [dataclasses.replace(case, law={**case.law, "damping": damping}) for case in loaded]
 
 
 class _Work:
@@ -292,10 +249,15 @@ class _Work:
     @contextmanager
     def collecting(self) -> Iterator[None]:
         """Turn Ctrl-C into an orderly end: what is done stays, the motion in progress is kept apart."""
-        from ssm_decouple.simulation.simulate import SimulationInterrupted
+        from ssm_decouple.simulation.simulate import SimulationDiverged, SimulationInterrupted
 
         try:
             yield
+        except SimulationDiverged as stopped:
+            from ssm_decouple.simulation.motion import save_motion
+
+            path = save_motion(stopped.motion, self.folder / "diverged.nc")
+            raise SimulationDiverged(f"{stopped}; the motion until then is in {path}", stopped.motion) from None
         except SimulationInterrupted as stopped:
             self.interrupted = True
             from ssm_decouple.simulation.motion import save_motion
@@ -309,13 +271,13 @@ class _Work:
         from ssm_decouple.simulation.motion import save_motion
 
         place = writable_folder(self.folder / case.name)
-        self.files.append(save_motion(motion, place / f"{_file_name(law)}.nc"))
+        self.files.append(save_motion(motion, place / f"{file_name(law)}.nc"))
 
     def draw(self, case: Case, law: str, motion: xr.Dataset) -> None:
         if not self.no_figures:
             from ssm_decouple.viewing.figures import save_figures
 
-            self.files += save_figures(motion, self.folder / case.name, _file_name(law))
+            self.files += save_figures(motion, self.folder / case.name, file_name(law))
 
     def draw_comparison(self, case: Case, motions: dict[str, xr.Dataset]) -> None:
         if not self.no_figures:
@@ -333,58 +295,20 @@ class _Work:
             found = {"interrupted": self.interrupted, "rows": rows, "files": [str(path) for path in self.files]}
             typer.echo(json.dumps(found, indent=2))
         elif self.rows:
-            _print_table(terminal_table(self.rows))
+            print_table(terminal_table(self.rows))
             for row in self.rows:
                 if (reason := explain(row)) is not None:
                     typer.echo(reason)
             typer.echo(f"\n{len(self.files)} files in {self.folder}")
         if self.interrupted:
-            _complain(
-                f"[bold yellow]interrupted:[/] {len(self.rows)} finished motions are kept in {_escape(self.folder)}"
+            complain(
+                f"[bold yellow]interrupted:[/] {len(self.rows)} finished motions are kept in {escape_markup(self.folder)}"
             )
             raise typer.Exit(INTERRUPTED)
 
 
-def _print_table(table: Table) -> None:
-    console = Console()
-    # Where the terminal is narrower, a line that wraps is easier to read than a number that is cut.
-    console.width = max(console.width, Console(width=1000).measure(table).maximum)
-    console.print(table)
-
-
-def _file_name(law: str) -> str:
-    return re.sub(r"[^\w.+@-]+", "_", law)
-
-
-@contextmanager
-def _progress(hidden: bool) -> Iterator[Any]:
-    columns, console = (TextColumn("{task.description:<40}"), BarColumn(), TimeElapsedColumn()), Console(stderr=True)
-    with Progress(*columns, console=console, transient=True, disable=hidden or not console.is_terminal) as bars:
-        task = bars.add_task("starting", total=1.0)
-        told: set[str] = set()
-
-        def show(case: str, law: str, share: float) -> None:
-            now = f"{case}, {law}"
-            bars.update(task, description=now, completed=share)
-            if not (hidden or console.is_terminal or now in told):  # in a log, a line for each motion instead of a bar
-                told.add(now)
-                typer.echo(now, err=True)
-
-        yield show
-
-
 def _show_warning(message: Warning | str, category: type[Warning], *_: Any, **__: Any) -> None:
     if issubclass(category, DecoupleWarning):
-        _complain(f"[bold yellow]warning:[/] {_escape(message)}")
+        complain(f"[bold yellow]warning:[/] {escape_markup(message)}")
     else:
-        _complain(f"{category.__name__}: {_escape(message)}")
-
-
-def _complain(line: str) -> None:
-    Console(stderr=True).print(line, soft_wrap=True, highlight=False)
-
-
-def _escape(text: object) -> str:
-    from rich.markup import escape
-
-    return escape(str(text))
+        complain(f"{category.__name__}: {escape_markup(message)}")

@@ -1,0 +1,428 @@
+"""Dynamic simulation: torques drive the joints; the base and the hinges of its appendages move as physics has it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import pinocchio as pin
+import xarray as xr
+from numpy.typing import NDArray
+
+from ssm_decouple.control.law import SelectiveLaw
+from ssm_decouple.errors import InputError, as_floats
+from ssm_decouple.model.plant import Plant
+from ssm_decouple.model.robot import UNLIMITED, Robot
+from ssm_decouple.simulation import physics
+
+Floats = NDArray[np.float64]
+
+# Radians of the fastest motion in one physics step: there the integrator's own damping ratio is 2e-4.
+COARSEST = 0.5
+TINY = 1e-300  # keeps a share of nothing from being NaN
+
+# What a dynamic motion records beside the rest. name: (dimensions, unit, frame, meaning)
+VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
+    "joint_velocities": (("time", "joint"), "rad/s or m/s", "joint", "true joint rates"),
+    "joint_torques": (("time", "joint"), "N m or N", "joint", "torques of the drives just before the sample"),
+    "hinge_angles": (("time", "hinge"), "rad", "hinge", "bending of the appendages"),
+    "tip_deflection": (("time", "appendage"), "m", "normal", "tip of each appendage out of its undeformed plane"),
+    "kinetic_energy": (("time",), "J", "", "audit: kinetic energy of the plant"),
+    "spring_energy": (("time",), "J", "", "audit: energy in the hinges' springs"),
+    "drive_work": (("time",), "J", "", "audit: work of the joint drives so far"),
+    "load_work": (("time",), "J", "", "audit: work of the external wrench so far"),
+    "damping_loss": (("time",), "J", "", "audit: energy lost in the hinges' dampers so far"),
+    "saturated_time": (("time",), "s", "", "time so far in which a drive stood at its torque limit"),
+}
+
+
+@dataclass(frozen=True)
+class Servo:
+    """The joint drives: computed torque, by the model that the law has, with a loop on position and rate.
+
+    Each joint answers to the commanded rates like the same second-order system, so that the joint rates stay weighted
+    means of commands: what the drives' lag costs the protection is of the order of the lag times the change of J_sub.
+
+    Attributes:
+        frequency: Natural frequency, Hz.
+        damping_ratio: 1 is critical.
+        period: Longest time between two torques, s; it is shortened to divide the time between samples. None makes a
+            new one in each physics step.
+        torque_limits: Largest torques (n,), N m, or one number; None takes the URDF's efforts.
+    """
+
+    frequency: float = 2.0
+    damping_ratio: float = 1.0
+    period: float | None = None
+    torque_limits: Floats | float | None = None
+
+
+@dataclass(frozen=True)
+class Sensors:
+    """What the law and its feedback see instead of the truth; the drives have sensors of their own.
+
+    Attributes:
+        encoder_noise: Standard deviation of each joint position at each sample, rad or m.
+        encoder_resolution: Joint positions are rounded to multiples of it, rad or m.
+        gyro_noise: Standard deviation of each component of the base angular velocity, a mean over a sample, rad/s.
+        seed: Of the noise.
+    """
+
+    encoder_noise: float = 0.0
+    encoder_resolution: float = 0.0
+    gyro_noise: float = 0.0
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class Load:
+    """A force and torque from outside that acts on the base for a while.
+
+    Attributes:
+        torque: N m (3,), base axes.
+        force: N (3,), at the base origin, base axes.
+        start: When it begins, s.
+        duration: How long it acts, s. Both times are rounded to physics steps.
+    """
+
+    torque: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    force: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    start: float = 0.0
+    duration: float = np.inf
+
+
+@dataclass(frozen=True)
+class Dynamic:
+    """The physics of a dynamic simulation.
+
+    Attributes:
+        step: Longest physics step, s; it is shortened to divide the time between samples.
+        servo: The drives; None prescribes the joint rates: they follow each command at once, whatever torque it takes,
+            and joint_torques tell it, but for the impulses at the jumps.
+        plant: What really moves, where it differs from the law's robot; its appendages bend. None is the law's robot
+            with its own appendages.
+        sensors: What the law sees; None is the truth.
+        load: What acts from outside; None is nothing, so that momentum is conserved.
+        feedback_gain: K, 1/s, of J_sub q_dot = -K theta, with theta the rotation about the protected axes as the
+            gyros tell it; 0 for no feedback.
+    """
+
+    step: float = 1e-3
+    servo: Servo | None = field(default_factory=Servo)
+    plant: Robot | None = None
+    sensors: Sensors | None = None
+    load: Load | None = None
+    feedback_gain: float = 0.0
+
+    def describe(self) -> dict[str, Any]:
+        """Return the settings in plain types, for a record."""
+        plain: dict[str, Any] = {"step": self.step, "feedback_gain": self.feedback_gain}
+        plain["plant"] = None if self.plant is None else self.plant.name
+        for name in ("servo", "sensors", "load"):
+            part = getattr(self, name)
+            plain[name] = None if part is None else asdict(part)
+        if self.servo is not None and self.servo.torque_limits is not None:
+            plain["servo"]["torque_limits"] = np.asarray(self.servo.torque_limits).tolist()
+        return plain
+
+
+def tree_of(model: pin.Model) -> tuple[NDArray[np.int64], Floats]:
+    """Return what `physics` needs of a Pinocchio model: the parent of each joint (N,) and the bodies (N + 1, ..).
+
+    Raises:
+        InputError: a joint with more than one degree of freedom, which URDFs do not have.
+    """
+    N = model.nv - 6
+    parent, tree = np.zeros(N, dtype=np.int64), np.zeros((N + 1, physics.TREE_SIZE))
+    tree[0, [0, 4, 8]] = 1.0
+    for i, joint in enumerate(model.joints[1:]):
+        inertia = model.inertias[joint.id]
+        tree[i, physics.BODY_MASS] = inertia.mass
+        tree[i, physics.CENTRE : physics.CENTRE + 3] = inertia.lever
+        tree[i, physics.INERTIA :] = np.array(inertia.inertia)[np.triu_indices(3)]
+        if i == 0:
+            continue
+        if joint.nv != 1:
+            raise InputError(f"joint '{model.names[joint.id]}' has {joint.nv} degrees of freedom; only 1 is supported")
+        placement, axis = model.jointPlacements[joint.id], np.ravel(joint.createData().S)
+        tree[i, :9], tree[i, 9:12] = placement.rotation.ravel(), placement.translation
+        revolute = np.any(axis[3:])
+        tree[i, physics.AXIS : physics.AXIS + 3] = axis[3:] if revolute else axis[:3]
+        tree[i, physics.PRISMATIC] = 0.0 if revolute else 1.0
+        parent[i - 1] = model.parents[joint.id] - 1
+    return parent, tree
+
+
+class DynamicMotion:
+    """A plant in motion: its state, its running sums and what of them is recorded at each sample.
+
+    Args:
+        settings: The physics.
+        law: The law that commands it.
+        q: Start configuration of the law's robot (nq,); everything is at rest and the appendages are straight.
+
+    Raises:
+        InputError: a number that makes no sense, another robot's joints, or a physics step that is too long.
+    """
+
+    def __init__(self, settings: Dynamic, law: SelectiveLaw, q: Floats) -> None:
+        _refuse_bad_numbers(settings)
+        self.settings, self.law = settings, law
+        robot = law.robot
+        self.plant = Plant.of(settings.plant or robot)
+        _refuse_other_joints(robot, self.plant.rigid)
+        # The law's joints by name among the plant's.
+        order = [self.plant.rigid.joint_names.index(name) for name in robot.joint_names]
+        self.driven = np.ascontiguousarray(self.plant.driven[order], dtype=np.int64)
+        there = dict(zip(robot.joint_names, robot.joint_positions(q), strict=True))
+        self.start = self.plant.configuration(self.plant.rigid.configuration(there, robot.base_pose(q)))
+        self.q = self._positions(self.start)
+        self.v: Floats = np.zeros(self.plant.robot.model.nv)
+        attitude = pin.Quaternion(q[3:7]).matrix()
+        self.pose: Floats = np.r_[attitude.ravel(), q[:3]]
+        self.reference: Floats = self.q[self.driven].copy()
+        self.torques: Floats = np.zeros((2, robot.n_joints))
+        self.totals: Floats = np.zeros(physics.TOTALS_SIZE)
+        self.measured: Floats = np.zeros(law.protection.k)
+        self._samples: list[tuple[Floats, Floats, Floats, Floats]] = []
+        self._noise = np.random.default_rng(settings.sensors.seed if settings.sensors else 0)
+        self._limits = _torque_limits(robot, settings.servo)
+        joints = np.vstack([self.plant.stiffness, self.plant.damping])
+        self._constants = (*tree_of(self.plant.robot.model), joints, self.driven, *tree_of(robot.model), self._limits)
+        _refuse_coarse_step(settings, self.plant, self.start)
+
+    def _positions(self, q: Floats) -> Floats:
+        return pin.difference(self.plant.robot.model, pin.neutral(self.plant.robot.model), q)[6:]
+
+    def configuration(self) -> Floats:
+        """Return the plant's configuration (nq,), Pinocchio's."""
+        model = self.plant.robot.model
+        q: Floats = pin.integrate(model, pin.neutral(model), np.r_[np.zeros(6), self.q])
+        q[:3] = self.pose[9:]
+        q[3:7] = pin.Quaternion(np.ascontiguousarray(self.pose[:9].reshape(3, 3))).normalized().coeffs()
+        return q
+
+    def seen(self) -> Floats:
+        """Return the configuration of the law's robot (nq,) as the sensors tell it."""
+        positions, sensors = self.q[self.driven], self.settings.sensors
+        if sensors is not None:
+            positions = positions + sensors.encoder_noise * self._noise.standard_normal(positions.size)
+            if sensors.encoder_resolution > 0:
+                positions = np.round(positions / sensors.encoder_resolution) * sensors.encoder_resolution
+        return self._law_configuration(positions)
+
+    def _law_configuration(self, positions: Floats) -> Floats:
+        model = self.law.robot.model
+        q: Floats = pin.integrate(model, pin.neutral(model), np.r_[np.zeros(6), positions])
+        q[:7] = self.configuration()[:7]
+        return q
+
+    def correction(self) -> Floats | None:
+        """Return the rate b (k,) about the protected directions that takes back what the gyros have told."""
+        return -self.settings.feedback_gain * self.measured if self.settings.feedback_gain else None
+
+    def move(self, rates: Floats, t: float, t_next: float) -> tuple[Floats, Floats]:
+        """Hold commanded joint rates (n,) from t to t_next.
+
+        Returns:
+            The configuration of the law's robot (nq,) then, and the integral of the base twist (6,), base axes.
+
+        Raises:
+            FloatingPointError: the motion has diverged; the message says when.
+        """
+        held, before = _holding(self.settings, t, t_next), self.totals[:6].copy()
+        bad = physics.advance(
+            *self._constants,
+            held,
+            np.ascontiguousarray(rates),
+            self.reference,
+            self.torques,
+            self.q,
+            self.v,
+            self.pose,
+            self.totals,
+        )
+        if bad != physics.OK:
+            raise FloatingPointError(f"{t + bad * held[physics.STEP]:.6g}")
+        twist = self.totals[:6] - before
+        self._measure(twist, t_next - t)
+        return self._law_configuration(self.q[self.driven]), twist
+
+    def sample(self) -> None:
+        """Remember the state for the record."""
+        self._samples.append((self.configuration(), self.v.copy(), self.torques[0].copy(), self.totals.copy()))
+
+    def _measure(self, twist: Floats, dt: float) -> None:
+        told, sensors, protection = twist.copy(), self.settings.sensors, self.law.protection
+        if sensors is not None:
+            told[3:] += sensors.gyro_noise * dt * self._noise.standard_normal(3)
+        if protection.frame == "inertial":
+            R = self.pose[:9].reshape(3, 3)
+            told = np.r_[R @ told[:3], R @ told[3:]]
+        self.measured += protection.U_twist.T @ told
+
+    def complete(self, motion: xr.Dataset) -> xr.Dataset:
+        """Return the record of the motion with the truth about the plant in it.
+
+        Args:
+            motion: What `build_motion` makes of the law's robot and commands.
+
+        Returns:
+            The same with the plant's velocities, momentum and end-effector, and with the drives, the appendages and
+            the energy as further variables.
+        """
+        configurations, velocities, torques, totals = (
+            np.array(part) for part in zip(*self._samples[: motion.sizes["time"]], strict=True)
+        )
+        momenta, centres, points, energies, carried = self._audit(configurations, velocities)
+        hinges = np.array([self._positions(q) for q in configurations])[:, self.plant.hinges]
+        spring = 0.5 * hinges**2 @ self.plant.stiffness[self.plant.hinges]
+        replaced = {
+            "base_linear_velocity": velocities[:, :3],
+            "base_angular_velocity": velocities[:, 3:6],
+            "linear_momentum": momenta[:, :3],
+            "angular_momentum": momenta[:, 3:],
+            "centre_of_mass": centres,
+            "end_effector_position": points,
+            "end_effector_error": np.linalg.norm(motion.target_position.values - points, axis=1),
+        }
+        for name, values in replaced.items():
+            motion[name].values = values
+        names = self.plant.robot.joint_names
+        motion = motion.assign_coords(
+            hinge=[names[place] for place in self.plant.hinges],
+            appendage=[appendage.name for appendage in self.plant.appendages],
+        )
+        added = {
+            "joint_velocities": velocities[:, 6 + self.driven],
+            "joint_torques": torques,
+            "hinge_angles": hinges,
+            "tip_deflection": self.plant.tip_deflections(hinges),
+            "kinetic_energy": energies,
+            "spring_energy": spring,
+            "drive_work": totals[:, physics.WORK],
+            "load_work": totals[:, physics.LOAD_WORK],
+            "damping_loss": totals[:, physics.LOSS],
+            "saturated_time": totals[:, physics.SATURATED],
+        }
+        for name, values in added.items():
+            dimensions, unit, frame, meaning = VARIABLES[name]
+            motion[name] = (dimensions, values, {"units": unit, "frame": frame, "long_name": meaning})
+        work = totals[:, physics.WORK] + totals[:, physics.LOAD_WORK] - totals[:, physics.LOSS]
+        energy = energies + spring
+        # About the inertial origin, where the impulse of a wrench does not need the centre of mass.
+        change = momenta - totals[:, physics.IMPULSE :]
+        change[:, 3:] += np.cross(centres, momenta[:, :3])
+        drift = np.abs(change - change[0]).reshape(-1, 2, 3).max((0, 2))
+        motion.attrs |= {
+            "physics": json.dumps(self.settings.describe()),
+            "energy_error": float(np.abs(energy - work).max() / max(energy.max(), TINY)),
+            "momentum_drift": float(np.max(drift / carried)),
+            "largest_torques": json.dumps(self.torques[1].tolist()),
+        }
+        return motion
+
+    def _audit(self, configurations: Floats, velocities: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+        """Return momenta (m, 6), centres of mass, end-effector (m, 3) and kinetic energy (m,) by Pinocchio.
+
+        The last are the largest sums of linear and angular momenta (2,) that base and joints carry one by one.
+        """
+        model = self.plant.robot.model
+        data, m = model.createData(), len(configurations)
+        frame = model.getFrameId(self.law.robot.end_effector)
+        momenta, centres, points, energies = np.empty((m, 6)), np.empty((m, 3)), np.empty((m, 3)), np.empty(m)
+        carried = np.full(2, TINY)
+        for i, (q, v) in enumerate(zip(configurations, velocities, strict=True)):
+            pin.ccrba(model, data, q, v)
+            momenta[i], centres[i] = data.hg.vector, data.com[0]
+            carried = np.maximum(carried, (np.abs(data.Ag) @ np.abs(v)).reshape(2, 3).max(axis=1))
+            points[i] = pin.updateFramePlacement(model, data, frame).translation
+            energies[i] = pin.computeKineticEnergy(model, data, q, v)
+        return momenta, centres, points, energies, carried
+
+
+def _holding(settings: Dynamic, t: float, t_next: float) -> Floats:
+    """Return the numbers that `physics.advance` needs for one hold."""
+    dt, servo = t_next - t, settings.servo
+    period = dt if servo is None or servo.period is None else servo.period
+    periods = max(1, int(np.ceil(dt / period * (1 - 1e-9))))
+    each = max(1, int(np.ceil(dt / periods / settings.step * (1 - 1e-9))))
+    steps = periods * each
+    held = np.zeros(physics.SETTINGS_SIZE)
+    held[physics.STEP], held[physics.STEPS] = dt / steps, steps
+    held[physics.STEPS_PER_TORQUE] = 1 if servo is None or servo.period is None else each
+    if servo is None:
+        held[physics.PRESCRIBED] = 1.0
+    else:
+        held[physics.FREQUENCY], held[physics.RATIO] = 2 * np.pi * servo.frequency, servo.damping_ratio
+    if settings.load is not None:
+        ends = np.array([settings.load.start, settings.load.start + settings.load.duration])
+        held[physics.LOAD_FROM : physics.LOAD_TO + 1] = np.clip(np.round((ends - t) / dt * steps), 0, steps)
+        held[physics.LOAD :] = *settings.load.force, *settings.load.torque
+    return held
+
+
+def _torque_limits(robot: Robot, servo: Servo | None) -> Floats:
+    if servo is None or servo.torque_limits is None:
+        efforts = np.array(robot.model.effortLimit[6:])
+        return np.where((efforts > 0) & (efforts < UNLIMITED), efforts, np.inf)
+    limits = as_floats("torque_limits", servo.torque_limits)
+    if limits.shape not in ((), (robot.n_joints,)) or not np.all(limits > 0):
+        raise InputError(f"torque_limits is {limits.tolist()}; give one positive number or {robot.n_joints}")
+    return np.broadcast_to(limits, (robot.n_joints,)).copy()
+
+
+def _refuse_other_joints(robot: Robot, rigid: Robot) -> None:
+    if not rigid.model.existFrame(robot.end_effector):
+        raise InputError(f"the plant '{rigid.name}' has no frame '{robot.end_effector}', the law's end-effector")
+    if set(robot.joint_names) != set(rigid.joint_names):
+        raise InputError(
+            f"the law commands the joints {', '.join(robot.joint_names)} of '{robot.name}', the plant '{rigid.name}' "
+            f"has {', '.join(rigid.joint_names)}; they must be the same"
+        )
+
+
+def _refuse_bad_numbers(settings: Dynamic) -> None:
+    positive, at_least_zero = {"physics step": settings.step}, {"feedback_gain": settings.feedback_gain}
+    if settings.servo is not None:
+        positive |= {"servo frequency": settings.servo.frequency, "servo damping_ratio": settings.servo.damping_ratio}
+        if settings.servo.period is not None:
+            positive["servo period"] = settings.servo.period
+    if settings.sensors is not None:
+        for name in ("encoder_noise", "encoder_resolution", "gyro_noise"):
+            at_least_zero[name] = getattr(settings.sensors, name)
+    for name, value in positive.items():
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"{name} is {value}; it must be a positive number")
+    for name, value in at_least_zero.items():
+        if not (np.isfinite(value) and value >= 0):
+            raise InputError(f"{name} is {value}; it must be zero or a positive number")
+    if settings.load is not None:
+        wrench = as_floats("load force", settings.load.force), as_floats("load torque", settings.load.torque)
+        if any(part.shape != (3,) or not np.all(np.isfinite(part)) for part in wrench):
+            raise InputError(f"load is {settings.load}; force and torque need 3 finite numbers each")
+        if not (settings.load.start >= 0 and settings.load.duration > 0):
+            raise InputError(
+                f"load starts at {settings.load.start} s for {settings.load.duration} s; give positive times"
+            )
+
+
+def _refuse_coarse_step(settings: Dynamic, plant: Plant, q: Floats) -> None:
+    times: list[tuple[str, float, str, float]] = []
+    if plant.hinges.size:
+        stiffest = plant.stiffest_frequency(q)
+        times.append(("physics step", settings.step, "the stiffest mode of the appendages", stiffest))
+    if settings.servo is not None:
+        times.append(("physics step", settings.step, "the servo", settings.servo.frequency))
+        if settings.servo.period is not None:
+            times[-1] = ("servo period", settings.servo.period, "the servo", settings.servo.frequency)
+    for name, time, what, frequency in times:
+        largest = COARSEST / (2 * np.pi * frequency)
+        if time > largest * (1 + 1e-9):
+            digit = 10.0 ** (np.floor(np.log10(largest)) - 1)
+            raise InputError(
+                f"a {name} of {time:g} s is too coarse for {what} at {frequency:.4g} Hz: use "
+                f"{np.floor(largest / digit) * digit:.2g} s or less"
+            )

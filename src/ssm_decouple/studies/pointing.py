@@ -1,0 +1,119 @@
+"""How far a line of sight wanders while the arm moves, in the dynamic simulation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+import xarray as xr
+from numpy.typing import ArrayLike, NDArray
+
+from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.simulation.dynamic import Dynamic
+from ssm_decouple.studies.case import Case
+
+Floats = NDArray[np.float64]
+
+ARCSEC = 3600.0 * 180.0 / np.pi  # in a radian
+
+
+@dataclass(frozen=True)
+class Pointing:
+    """What one law does to a line of sight; arcseconds, as it is for people to read.
+
+    Attributes:
+        case: Name of the case.
+        law: "none", "selective" (the line of sight protected) or "reactionless"; "planned" with three hold nodes.
+        k: Protected directions.
+        peak_arcsec: Largest angle between the line of sight and where it looked at the start.
+        rms_arcsec: The same, root mean square over the motion.
+        end_arcsec: The same at the end.
+        outcome: "converged", "stalled" or "running".
+        outcome_time_s: When.
+        final_error_m: Distance to the target at the end.
+        saturated_s: Time in which a drive stood at its torque limit.
+        energy_error: Of the simulation, relative.
+        momentum_drift: The same.
+    """
+
+    case: str
+    law: str
+    k: int
+    peak_arcsec: float
+    rms_arcsec: float
+    end_arcsec: float
+    outcome: str
+    outcome_time_s: float
+    final_error_m: float
+    saturated_s: float
+    energy_error: float
+    momentum_drift: float
+
+
+def pointing_error(motion: xr.Dataset, boresight: ArrayLike) -> Floats:
+    """Return the angle between a line of sight fixed in base axes and where it looked at the start (m,), rad."""
+    from scipy.spatial.transform import Rotation
+
+    line = np.asarray(boresight, dtype=float) / np.linalg.norm(boresight)
+    lines = Rotation.from_quat(motion.base_quaternion.values).apply(line)
+    across = np.linalg.norm(np.cross(lines, lines[0]), axis=1)
+    return np.arctan2(across, lines @ lines[0])
+
+
+def pointing(
+    case: Case,
+    boresight: ArrayLike = (0.0, 1.0, 0.0),
+    physics: Dynamic | None = None,
+    progress: Callable[[str, float], object] | None = None,
+) -> Iterator[tuple[Pointing, xr.Dataset]]:
+    """Run a case with joints driven by torques, under laws that protect nothing, the line of sight, and all axes.
+
+    Args:
+        case: The case; its own protection is replaced by that of the line of sight.
+        boresight: Where the instrument looks (3,), base axes.
+        physics: The dynamic simulation; None is its default.
+        progress: Called now and then with the law and the share of its motion that is done.
+
+    Yields:
+        For each law the figures and the motion.
+
+    Raises:
+        InputError: the boresight is zero or not finite.
+    """
+    sight = Protection.boresight(boresight)
+    laws = {
+        "none": (Protection("none"), 0),
+        "selective": (sight, 0),
+        "selective, planned": (sight, 3),
+        "reactionless": (Protection("all"), 0),
+        "reactionless, planned": (Protection("all"), 3),
+    }
+    for name, (protection, nodes) in laws.items():
+        variant = replace(
+            case,
+            protection=sight,
+            law={**case.law, "hold_nodes": nodes},
+            simulation={**case.simulation, "method": physics or Dynamic()},
+        )
+        motion = variant.run(protection, progress=None if progress is None else partial(progress, name))
+        error = ARCSEC * pointing_error(motion, boresight)
+        motion.attrs["boresight"] = np.asarray(boresight, dtype=float).tolist()
+        yield (
+            Pointing(
+                case=case.name,
+                law=name,
+                k=protection.k,
+                peak_arcsec=float(error.max()),
+                rms_arcsec=float(np.sqrt(np.mean(error**2))),
+                end_arcsec=float(error[-1]),
+                outcome=motion.attrs["outcome"],
+                outcome_time_s=float(motion.attrs["outcome_time"]),
+                final_error_m=float(motion.attrs["final_error"]),
+                saturated_s=float(motion.saturated_time[-1]),
+                energy_error=float(motion.attrs["energy_error"]),
+                momentum_drift=float(motion.attrs["momentum_drift"]),
+            ),
+            motion,
+        )
