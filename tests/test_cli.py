@@ -228,3 +228,16 @@ def test_numbers_that_cannot_be_read(short_case, tmp_path):
     done = call("study", "pointing", short_case, "-o", tmp_path, "--boresight", "up")
     assert done.returncode == 1
     assert "--boresight is 'up'; give numbers with commas between them" in done.stderr
+
+
+def test_drives_that_are_too_weak_are_told_with_their_times(write, tmp_path):
+    """Joints of 1 N m cannot start as the law asks; the motion goes on and the times are told."""
+    urdf = ssm.load_robot("ets_vii").urdf.replace('effort="100"', 'effort="1"')
+    assert urdf != ssm.load_robot("ets_vii").urdf
+    write(urdf, "weak.urdf")
+    text = ssm.cases()["case1"].read_text().replace("duration = 150", "duration = 20")
+    path = write(text.replace('robot = "ets_vii"', 'robot = "weak.urdf"'), "weak.toml")
+    done = call("run", path, "--dynamic", "--no-figures", "-o", tmp_path / "out")
+    assert done.returncode == 3, done.stderr
+    assert "weak, selective: drives at their torque limits for" in done.stdout
+    assert "0.0 to " in done.stdout

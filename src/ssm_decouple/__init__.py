@@ -43,7 +43,7 @@ if TYPE_CHECKING:
     from ssm_decouple.simulation.dynamic import Servo as Servo
     from ssm_decouple.simulation.motion import load_motion as load_motion
     from ssm_decouple.simulation.motion import save_motion as save_motion
-    from ssm_decouple.simulation.simulate import SimulationDiverged as SimulationDiverged
+    from ssm_decouple.simulation.simulate import DivergenceError as DivergenceError
     from ssm_decouple.simulation.simulate import SimulationInterrupted as SimulationInterrupted
     from ssm_decouple.simulation.simulate import simulate as simulate
     from ssm_decouple.studies.case import Case as Case
@@ -76,7 +76,7 @@ _HOME = {
     "SelectiveLaw": "control.law",
     "Sensors": "simulation.dynamic",
     "Servo": "simulation.dynamic",
-    "SimulationDiverged": "simulation.simulate",
+    "DivergenceError": "simulation.simulate",
     "SimulationInterrupted": "simulation.simulate",
     "Tolerances": "model.perturb",
     "cases": "studies.case",

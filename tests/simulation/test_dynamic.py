@@ -21,7 +21,7 @@ from scipy.spatial.transform import Rotation
 import ssm_decouple as ssm
 from ssm_decouple.model.perturb import Tolerances, perturbed
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion, Load, Sensors, Servo
-from ssm_decouple.simulation.simulate import SimulationDiverged
+from ssm_decouple.simulation.simulate import DivergenceError
 
 START = np.deg2rad([150, -20, -10, 0, 0, 0])
 TARGET = [-1.8, -0.3, 1.2]
@@ -417,7 +417,7 @@ def test_torque_limits_come_from_the_urdf():
 
 
 def test_a_motion_that_runs_away_keeps_what_was_before(ets_vii):
-    with pytest.raises(SimulationDiverged, match=r"diverged at (3\.\d+) s: .* try a shorter physics step") as caught:
+    with pytest.raises(DivergenceError, match=r"diverged at (3\.\d+) s: .* try a shorter physics step") as caught:
         run(ets_vii, 10.0, load=Load(torque=(1e9, 0, 0), start=3.0))
     when = float(re.search(r"at ([\d.]+) s", str(caught.value)).group(1))
     kept = caught.value.motion
@@ -430,7 +430,7 @@ def test_a_motion_that_runs_away_keeps_what_was_before(ets_vii):
 
 
 def test_divergence_at_once_leaves_the_start(ets_vii):
-    with pytest.raises(SimulationDiverged) as caught:
+    with pytest.raises(DivergenceError) as caught:
         run(ets_vii, 1.0, load=Load(force=(1e12, 0, 0)))
     assert caught.value.motion.sizes["time"] == 1
 

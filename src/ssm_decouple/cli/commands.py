@@ -249,15 +249,15 @@ class _Work:
     @contextmanager
     def collecting(self) -> Iterator[None]:
         """Turn Ctrl-C into an orderly end: what is done stays, the motion in progress is kept apart."""
-        from ssm_decouple.simulation.simulate import SimulationDiverged, SimulationInterrupted
+        from ssm_decouple.simulation.simulate import DivergenceError, SimulationInterrupted
 
         try:
             yield
-        except SimulationDiverged as stopped:
+        except DivergenceError as stopped:
             from ssm_decouple.simulation.motion import save_motion
 
             path = save_motion(stopped.motion, self.folder / "diverged.nc")
-            raise SimulationDiverged(f"{stopped}; the motion until then is in {path}", stopped.motion) from None
+            raise DivergenceError(f"{stopped}; the motion until then is in {path}", stopped.motion) from None
         except SimulationInterrupted as stopped:
             self.interrupted = True
             from ssm_decouple.simulation.motion import save_motion
@@ -288,7 +288,7 @@ class _Work:
 
     def report(self) -> None:
         """Print the rows, the reasons and where the files are; leave with the interrupted status if it was."""
-        from ssm_decouple.viewing.table import explain, terminal_table
+        from ssm_decouple.viewing.table import explain, saturation, terminal_table
 
         if self.as_json:
             rows: list[dict[str, Any]] = [dataclasses.asdict(row) for row in self.rows]
@@ -297,12 +297,13 @@ class _Work:
         elif self.rows:
             print_table(terminal_table(self.rows))
             for row in self.rows:
-                if (reason := explain(row)) is not None:
-                    typer.echo(reason)
+                for remark in filter(None, (explain(row), saturation(row))):
+                    typer.echo(remark)
             typer.echo(f"\n{len(self.files)} files in {self.folder}")
         if self.interrupted:
             complain(
-                f"[bold yellow]interrupted:[/] {len(self.rows)} finished motions are kept in {escape_markup(self.folder)}"
+                f"[bold yellow]interrupted:[/] {len(self.rows)} finished motions are kept in "
+                f"{escape_markup(self.folder)}"
             )
             raise typer.Exit(INTERRUPTED)
 

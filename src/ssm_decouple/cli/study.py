@@ -152,7 +152,7 @@ def study_robustness(
     no_progress: NoProgress = False,
     as_json: AsJson = False,
 ) -> None:
-    """What is left of the protection when masses, inertias, centres of mass and mounts are off; and one thing at a time.
+    """What is left of the protection when masses, inertias, centres of mass and mounts are off; and single causes.
 
     At p per cent, masses and inertias are off by up to p per cent and lengths by up to p mm. Without feedback and
     with J_sub q_dot = -K theta. Writes OUTPUT/robustness.csv, effects.csv and a figure. Some minutes a case.

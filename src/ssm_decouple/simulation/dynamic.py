@@ -181,6 +181,8 @@ class DynamicMotion:
         self.q = self._positions(self.start)
         self.v: Floats = np.zeros(self.plant.robot.model.nv)
         attitude = pin.Quaternion(q[3:7]).matrix()
+        self._plant_moved: Floats = np.zeros(self.plant.robot.model.nv)
+        self._law_moved: Floats = np.zeros(robot.model.nv)
         self.pose: Floats = np.r_[attitude.ravel(), q[:3]]
         self.reference: Floats = self.q[self.driven].copy()
         self.torques: Floats = np.zeros((2, robot.n_joints))
@@ -198,10 +200,14 @@ class DynamicMotion:
 
     def configuration(self) -> Floats:
         """Return the plant's configuration (nq,), Pinocchio's."""
-        model = self.plant.robot.model
-        q: Floats = pin.integrate(model, pin.neutral(model), np.r_[np.zeros(6), self.q])
+        return self._with_base(self.plant.robot.model, self._plant_moved, self.q)
+
+    def _with_base(self, model: pin.Model, moved: Floats, positions: Floats) -> Floats:
+        """Return a configuration of a model with the base where it is; `moved` is a buffer, its base part zero."""
+        moved[6:] = positions
+        q: Floats = pin.integrate(model, pin.neutral(model), moved)
         q[:3] = self.pose[9:]
-        q[3:7] = pin.Quaternion(np.ascontiguousarray(self.pose[:9].reshape(3, 3))).normalized().coeffs()
+        q[3:7] = pin.Quaternion(self.pose[:9].reshape(3, 3)).normalized().coeffs()
         return q
 
     def seen(self) -> Floats:
@@ -214,10 +220,7 @@ class DynamicMotion:
         return self._law_configuration(positions)
 
     def _law_configuration(self, positions: Floats) -> Floats:
-        model = self.law.robot.model
-        q: Floats = pin.integrate(model, pin.neutral(model), np.r_[np.zeros(6), positions])
-        q[:7] = self.configuration()[:7]
-        return q
+        return self._with_base(self.law.robot.model, self._law_moved, positions)
 
     def correction(self) -> Floats | None:
         """Return the rate b (k,) about the protected directions that takes back what the gyros have told."""
@@ -321,6 +324,7 @@ class DynamicMotion:
             "energy_error": float(np.abs(energy - work).max() / max(energy.max(), TINY)),
             "momentum_drift": float(np.max(drift / carried)),
             "largest_torques": json.dumps(self.torques[1].tolist()),
+            "saturated": json.dumps(_spans(motion.time.values, np.diff(totals[:, physics.SATURATED]) > 0)),
         }
         return motion
 
@@ -341,6 +345,12 @@ class DynamicMotion:
             points[i] = pin.updateFramePlacement(model, data, frame).translation
             energies[i] = pin.computeKineticEnergy(model, data, q, v)
         return momenta, centres, points, energies, carried
+
+
+def _spans(time: Floats, flags: NDArray[np.bool_]) -> list[list[float]]:
+    """Return from when to when (s) the holds between samples (m - 1,) are flagged."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [[float(time[start]), float(time[end])] for start, end in edges.reshape(-1, 2)]
 
 
 def _holding(settings: Dynamic, t: float, t_next: float) -> Floats:

@@ -34,7 +34,7 @@ TREE_SIZE = 26
 FRAME = 0  # 12: rotation of the joint frame by rows, position
 WHOLE = 12  # 10: inertia, first the body's, then that of all that it carries; see `place_inertia`
 SPEED = 22  # 6: its twist
-RUSH = 28  # 6: the rate of change of that at zero acceleration
+DRIFT = 28  # 6: its acceleration when no coordinate accelerates: products of velocities
 FORCE = 34  # 6: the wrench that this takes, first for the body, then for all that it carries
 MOVED = 40  # 6: momentum, first of the body, then of what it carries under a unit rate of its joint
 MOTION = 46  # 6: twist that a unit rate of its joint gives it
@@ -162,25 +162,25 @@ def equations(parent: Ints, tree: Floats, q: Floats, v: Floats, bodies: Floats, 
     place_bodies(parent, tree, q, bodies)
     for i in range(tree.shape[0]):
         me = bodies[i]
-        w, rush, f, p = me[SPEED:], me[RUSH:], me[FORCE:], me[MOVED:]
+        w, drift, f, p = me[SPEED:], me[DRIFT:], me[FORCE:], me[MOVED:]
         if i == 0:
             for c in range(6):
                 w[c] = v[c]
-                rush[c] = 0.0
+                drift[c] = 0.0
         else:
             up, rate = bodies[parent[i - 1]], v[5 + i]
             for c in range(6):
                 w[c] = up[SPEED + c] + me[MOTION + c] * rate
             x, y, z = me[MOTION] * rate, me[MOTION + 1] * rate, me[MOTION + 2] * rate
             a, b, c = me[MOTION + 3] * rate, me[MOTION + 4] * rate, me[MOTION + 5] * rate
-            rush[0] = up[RUSH] + w[4] * z - w[5] * y + w[1] * c - w[2] * b
-            rush[1] = up[RUSH + 1] + w[5] * x - w[3] * z + w[2] * a - w[0] * c
-            rush[2] = up[RUSH + 2] + w[3] * y - w[4] * x + w[0] * b - w[1] * a
-            rush[3] = up[RUSH + 3] + w[4] * c - w[5] * b
-            rush[4] = up[RUSH + 4] + w[5] * a - w[3] * c
-            rush[5] = up[RUSH + 5] + w[3] * b - w[4] * a
+            drift[0] = up[DRIFT] + w[4] * z - w[5] * y + w[1] * c - w[2] * b
+            drift[1] = up[DRIFT + 1] + w[5] * x - w[3] * z + w[2] * a - w[0] * c
+            drift[2] = up[DRIFT + 2] + w[3] * y - w[4] * x + w[0] * b - w[1] * a
+            drift[3] = up[DRIFT + 3] + w[4] * c - w[5] * b
+            drift[4] = up[DRIFT + 4] + w[5] * a - w[3] * c
+            drift[5] = up[DRIFT + 5] + w[3] * b - w[4] * a
         place_inertia(tree[i], me, me[WHOLE:])
-        momentum_of(me[WHOLE:], rush, f)
+        momentum_of(me[WHOLE:], drift, f)
         momentum_of(me[WHOLE:], w, p)
         f[0] += w[4] * p[2] - w[5] * p[1]
         f[1] += w[5] * p[0] - w[3] * p[2]

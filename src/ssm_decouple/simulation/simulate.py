@@ -34,7 +34,7 @@ class SimulationInterrupted(KeyboardInterrupt):
         self.motion = motion
 
 
-class SimulationDiverged(DecoupleError, ArithmeticError):
+class DivergenceError(DecoupleError, ArithmeticError):
     """A dynamic simulation whose numbers have run away; `motion` holds the samples before."""
 
     def __init__(self, message: str, motion: xr.Dataset) -> None:
@@ -83,11 +83,12 @@ def simulate(
         ("converged", "stalled" or "running"), `outcome_time` (s), `final_error` (m), the law's settings, the method
         and the versions. A dynamic motion has also joint_velocities, joint_torques, hinge_angles, tip_deflection,
         kinetic_energy, spring_energy, drive_work, load_work, damping_loss, saturated_time, and the attributes
-        `physics`, `energy_error`, `momentum_drift` (both relative) and `largest_torques`.
+        `physics`, `energy_error`, `momentum_drift` (both relative), `largest_torques` and `saturated`: from when to
+        when a drive stood at its torque limit.
 
     Raises:
         InputError: an argument makes no sense; the message names it.
-        SimulationDiverged: the numbers of a dynamic simulation run away; it carries the motion until then.
+        DivergenceError: the numbers of a dynamic simulation run away; it carries the motion until then.
         SimulationInterrupted: Ctrl-C; it is a KeyboardInterrupt and carries the motion so far.
     """
     time = _sample_times(duration, dt)
@@ -115,7 +116,7 @@ def simulate(
             raise
         raise SimulationInterrupted(run.record()) from None
     except FloatingPointError as when:
-        raise SimulationDiverged(
+        raise DivergenceError(
             f"the simulation has diverged at {when} s: the equations of motion run away or have no solution there; try "
             "a shorter physics step or a softer servo",
             run.record(),

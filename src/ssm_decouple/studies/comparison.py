@@ -48,6 +48,7 @@ class Summary:
         joint_travel_deg: Joint rates' norm integrated over time.
         acceleration_max_deg_s2: Largest change of a joint rate from sample to sample, from rest on, over dt.
         centre_of_mass_drift_m: How far the centre of mass wandered: the integrator's error, zero in physics.
+        saturated: In a dynamic simulation, from when to when, s, a drive stood at its torque limit.
     """
 
     case: str
@@ -71,6 +72,7 @@ class Summary:
     joint_travel_deg: float
     acceleration_max_deg_s2: float
     centre_of_mass_drift_m: float
+    saturated: tuple[tuple[float, float], ...] = ()
 
 
 def summarise(motion: xr.Dataset, law: str) -> Summary:
@@ -111,6 +113,7 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         joint_travel_deg=float(np.rad2deg(np.sum(speed[:-1] * np.diff(time)))),
         acceleration_max_deg_s2=float(np.rad2deg(np.abs(changes / np.diff(time)[:, None]).max())),
         centre_of_mass_drift_m=float(np.linalg.norm(drift, axis=1).max()),
+        saturated=tuple((start, end) for start, end in json.loads(motion.attrs.get("saturated", "[]"))),
     )
 
 

@@ -158,6 +158,16 @@ def _empty(headings: Sequence[str], words: Sequence[str]) -> Table:
     return table
 
 
+def saturation(row: Summary) -> str | None:
+    """Say when the drives stood at their torque limits; None if they never did."""
+    if not row.saturated:
+        return None
+    total = sum(end - start for start, end in row.saturated)
+    listed = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in row.saturated[:3])
+    more = f" and {len(row.saturated) - 3} times more" if row.saturated[3:] else ""
+    return f"{row.case}, {row.law}: drives at their torque limits for {total:.1f} s: {listed}{more}."
+
+
 def explain(row: Summary) -> str | None:
     """Say where and why a motion did not arrive; None if it did."""
     if row.outcome == "converged":
