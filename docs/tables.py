@@ -2,33 +2,48 @@
 
 python docs/tables.py           # rewrite the blocks between <!-- begin NAME --> and <!-- end NAME -->
 python docs/tables.py --check   # exit status 1 if one is out of date
-python docs/tables.py speed     # rewrite the timings, which no check holds: machines differ
+python docs/tables.py speed robustness ..   # rewrite blocks that no check holds: timings differ from machine to
+                                            # machine, and the Monte Carlo study takes a quarter of an hour
 """
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
 import numpy as np
+import xarray as xr
+from matplotlib.figure import Figure
 
 import ssm_decouple as ssm
+from ssm_decouple.studies.bending import Bending, bending, flexible
 from ssm_decouple.studies.comparison import Summary, summarise
+from ssm_decouple.studies.pointing import Pointing, pointing
+from ssm_decouple.studies.robustness import Leak, Robustness, effects
 from ssm_decouple.studies.sampling import Drift, sampling
-from ssm_decouple.viewing.figures import comparison, configuration
-from ssm_decouple.viewing.figures import sampling as draw_sampling
+from ssm_decouple.viewing import figures
 from ssm_decouple.viewing.style import save
-from ssm_decouple.viewing.table import drift_table, explain, markdown, markdown_table
+from ssm_decouple.viewing.table import (
+    bending_table,
+    drift_table,
+    effect_table,
+    explain,
+    leak_table,
+    markdown,
+    markdown_table,
+    pointing_table,
+)
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = (ROOT / "README.md", ROOT / "docs" / "models.md", ROOT / "docs" / "limits.md")
+DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
 
 
 @cache
@@ -108,6 +123,73 @@ def gentle() -> str:
     return markdown(lines)
 
 
+@cache
+def bent() -> dict[str, dict[str, tuple[Bending, xr.Dataset]]]:
+    """Return what bends in cases 1 to 3, by case and protection, computed once for the table and the figure."""
+    cases = [flexible(ssm.load_case(f"case{i}")) for i in (1, 2, 3)]
+    return {case.name: {row.protection: (row, motion) for row, motion in bending(case)} for case in cases}
+
+
+@cache
+def pointed() -> dict[str, tuple[Pointing, xr.Dataset]]:
+    """Return how the line of sight wanders in case 3, computed once for the table and the figure."""
+    return {row.law: (row, motion) for row, motion in pointing(ssm.load_case("case3"))}
+
+
+def bending_block() -> str:
+    """Return how the appendages bend in cases 1 to 3."""
+    return markdown(bending_table([row for runs in bent().values() for row, _ in runs.values()]))
+
+
+def pointing_block() -> str:
+    """Return how the line of sight wanders in case 3."""
+    return markdown(pointing_table([row for row, _ in pointed().values()]))
+
+
+def dynamic() -> str:
+    """Return cases 1 to 3 under torques: how they end, what is left of the protection, and the audit."""
+    lines = [["case", "law", "outcome", "left (mm)", "drift (deg)", "largest torque (N m)", "at limits (s)"]]
+    for i in (1, 2, 3):
+        for nodes, law in ((0, "at the sample"), (3, "three Gauss points")):
+            case = ssm.load_case(f"case{i}")
+            variant = replace(case, law={**case.law, "hold_nodes": nodes}, simulation={"method": ssm.Dynamic()})
+            motion = variant.run()
+            lines.append(
+                [
+                    case.name,
+                    law,
+                    f"{motion.attrs['outcome']}, {motion.attrs['outcome_time']:.0f} s",
+                    f"{1e3 * motion.attrs['final_error']:.2f}",
+                    f"{np.rad2deg(np.abs(motion.protected_angle.values).max()):.1e}",
+                    f"{max(json.loads(motion.attrs['largest_torques'])):.0f}",
+                    f"{float(motion.saturated_time[-1]):.1f}",
+                ]
+            )
+    return markdown(lines)
+
+
+@cache
+def leaks() -> list[Leak]:
+    """Return the Monte Carlo study of cases 1 to 3, computed once for the table and the figure."""
+    rows = []
+    for i in (1, 2, 3):
+        campaign = Robustness(ssm.load_case(f"case{i}"))
+        campaign.run(lambda share, i=i: print(f"\rcase{i} {share:4.0%}", end="", file=sys.stderr))
+        rows += campaign.leaks()
+    return rows
+
+
+def robustness() -> str:
+    """Return what errors in the model leave of the protection, and draw the figure."""
+    draw({"robustness": figures.robustness(leaks())})
+    return markdown(leak_table(leaks()))
+
+
+def effects_block() -> str:
+    """Return what single imperfections leave of the protection in cases 1 to 3."""
+    return markdown(effect_table([row for i in (1, 2, 3) for row in effects(ssm.load_case(f"case{i}"))]))
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
     "cases": lambda: cases_table(""),
     "flight": lambda: cases_table("_flight"),
@@ -116,6 +198,15 @@ BLOCKS: dict[str, Callable[[], str]] = {
     "patience": patience,
     "drift": drift,
     "gentle": gentle,
+    "bending": bending_block,
+    "pointing": pointing_block,
+    "dynamic": dynamic,
+    "effects": effects_block,
+}
+KEPT: dict[str, Callable[[], str]] = {
+    "speed": lambda: printed_by("control_step.py"),
+    "dynamic_speed": lambda: printed_by("dynamic.py"),
+    "robustness": robustness,
 }
 
 
@@ -134,51 +225,63 @@ def agree(old: str, new: str) -> bool:
     return all("e" in b or abs(float(a) - float(b)) <= 0.03 * abs(float(b)) + 2e-3 for a, b in pairs)
 
 
-def draw() -> None:
-    """Write the figures that the documents show."""
+def draw(sheets: Mapping[str, Figure]) -> None:
+    """Write figures that the documents show."""
     folder = ROOT / "docs" / "images"
     folder.mkdir(exist_ok=True)
     with tempfile.TemporaryDirectory() as scratch:
-        save(comparison(compared("case1").motions), scratch, "case1_comparison")
-        save(configuration(compared("case2").motions["selective"]), scratch, "case2_configuration")
-        save(draw_sampling(drifts()), scratch, "sampling")
+        for name, figure in sheets.items():
+            save(figure, scratch, name)
         for path in Path(scratch).glob("*.png"):
             shutil.copy(path, folder / path.name)
 
 
-def speed() -> str:
-    """Return what the benchmark of one control step prints here."""
-    words = [sys.executable, str(ROOT / "benchmarks" / "control_step.py")]
+def sheets() -> dict[str, Figure]:
+    """Return the figures of what the checked blocks tell."""
+    wings = {law: motion for law, (_, motion) in bent()["case1"].items()}
+    return {
+        "case1_comparison": figures.comparison(compared("case1").motions),
+        "case2_configuration": figures.configuration(compared("case2").motions["selective"]),
+        "sampling": figures.sampling(drifts()),
+        "case1_bending": figures.bending((flexible(ssm.load_case("case1")), wings)),
+        "case3_pointing": figures.pointing({law: motion for law, (_, motion) in pointed().items()}),
+    }
+
+
+def printed_by(benchmark: str) -> str:
+    """Return what a benchmark prints here."""
+    words = [sys.executable, str(ROOT / "benchmarks" / benchmark)]
     printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
     return f"```text\n{printed}\n```"
 
 
-def main(check: bool, timings: bool) -> int:
-    """Rewrite or check every block, or rewrite the timings; return the exit status."""
+def main(check: bool, named: Sequence[str]) -> int:
+    """Rewrite or check every block but the kept ones, or rewrite the named ones; return the exit status."""
     made: dict[str, str] = {}
     stale = []
     for document in DOCUMENTS:
         text = document.read_text(encoding="utf-8")
         for name in re.findall(r"<!-- begin (\w+) -->", text):
-            if (name == "speed") != timings:
+            if name not in named if named else name in KEPT:
                 continue
-            if name not in made:
-                made[name] = speed() if timings else BLOCKS[name]()
             pattern = rf"(<!-- begin {name} -->\n\n)(.*?)(\n\n<!-- end {name} -->)"
             old = re.search(pattern, text, re.DOTALL)
             if old is None:
                 raise SystemExit(f"{document}: block '{name}' has no end, or no blank lines about it")
+            if name not in made:
+                made[name] = {**BLOCKS, **KEPT}[name]()
             if not (agree(old[2], made[name]) if check else old[2] == made[name]):
                 stale.append(f"{document.relative_to(ROOT)}: {name}")
                 text = text[: old.start(2)] + made[name] + text[old.end(2) :]
         if not check:
             document.write_text(text, encoding="utf-8")
-    if not check and not timings:
-        draw()
+    if not check and not named:
+        draw(sheets())
     for block in stale:
         print(f"{'out of date' if check else 'rewritten'}: {block}")
     return int(check and bool(stale))
 
 
 if __name__ == "__main__":
-    sys.exit(main("--check" in sys.argv[1:], "speed" in sys.argv[1:]))
+    given = sys.argv[1:]
+    sys.exit(main("--check" in given, [word for word in given if word != "--check"]))
