@@ -581,3 +581,17 @@ def test_gyro_noise_reaches_only_the_feedback(ets_vii):
 def test_feedback_with_nothing_and_with_everything_protected(ets_vii, axes):
     motion = run(ets_vii, 3.0, law=law_of(ets_vii, axes), feedback_gain=0.2)
     assert motion.momentum_drift < 1e-11
+
+
+@pytest.mark.parametrize("frame", ["base", "inertial"])
+def test_the_protected_rate_of_a_dynamic_motion_is_the_truth(ets_vii, frame):
+    """Not what the law believes, which is rounding: against differences of the recorded attitude."""
+    law = ssm.SelectiveLaw(ets_vii, ssm.Protection("yaw", frame))
+    q = ets_vii.configuration(np.deg2rad([150, -20, -10, 0, 0, 0]))
+    motion = ssm.simulate(law, q, [-1.8, -0.3, 1.2], 5.0, 0.01, ssm.Dynamic(step=0.005), smooth_start=3.0)
+    attitude = Rotation.from_quat(motion.base_quaternion.values)
+    left, right = attitude[:-2], attitude[2:]
+    turned = (left.inv() * right if frame == "base" else right * left.inv()).as_rotvec()[:, 2] / 0.02
+    truth = motion.protected_rate.values[1:-1, 0]
+    assert np.abs(truth).max() > 1e-9
+    np.testing.assert_allclose(turned, truth, atol=0.02 * np.abs(truth).max())

@@ -16,6 +16,7 @@ from ssm_decouple.errors import InputError, as_floats
 from ssm_decouple.model.plant import Plant
 from ssm_decouple.model.robot import UNLIMITED, Robot
 from ssm_decouple.simulation import physics
+from ssm_decouple.simulation.motion import twist_along
 
 Floats = NDArray[np.float64]
 
@@ -282,7 +283,11 @@ class DynamicMotion:
         momenta, centres, points, energies, carried = self._audit(configurations, velocities)
         hinges = np.array([self._positions(q) for q in configurations])[:, self.plant.hinges]
         spring = 0.5 * hinges**2 @ self.plant.stiffness[self.plant.hinges]
+        protection = self.law.protection
         replaced = {
+            "protected_rate": twist_along(
+                protection.U_twist, protection.frame, velocities[:, :6], motion.base_quaternion.values
+            ),
             "base_linear_velocity": velocities[:, :3],
             "base_angular_velocity": velocities[:, 3:6],
             "linear_momentum": momenta[:, :3],

@@ -80,7 +80,7 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
         ("time", "protected"),
         "rad/s, or m/s and rad/s",
         "U_c",
-        "U_c^T (base twist) as the law sees it: at the sample, or its mean over the hold",
+        "U_c^T (base twist) as the law sees it, at the sample or as mean over the hold; in a dynamic motion the truth",
     ),
     "protected_angle": (
         ("time", "protected"),
@@ -135,6 +135,23 @@ def protected_integral(U_twist: Floats, frame: str, twists: Floats, configuratio
     turns = np.zeros((len(twists), 3))
     turns[1:] = np.cumsum((attitude[1:] * attitude[:-1].inv()).as_rotvec(), axis=0)
     return np.hstack([configurations[:, :3] - configurations[0, :3], turns]) @ U_twist
+
+
+def twist_along(U_twist: Floats, frame: str, twists: Floats, quaternions: Floats) -> Floats:
+    """Return the components of base twists along directions (m, k), m/s and rad/s.
+
+    Args:
+        U_twist: Directions of the base twist, columns (6, k).
+        frame: "base" or "inertial".
+        twists: Base twists in base axes (m, 6).
+        quaternions: Base attitudes (m, 4), x y z w.
+    """
+    from scipy.spatial.transform import Rotation
+
+    if frame == "base":
+        return twists @ U_twist
+    attitude = Rotation.from_quat(quaternions)
+    return np.hstack([attitude.apply(twists[:, :3]), attitude.apply(twists[:, 3:])]) @ U_twist
 
 
 def build_motion(

@@ -14,7 +14,7 @@ import xarray as xr
 
 from ssm_decouple.files import written_whole
 from ssm_decouple.momentum.protection import Protection
-from ssm_decouple.simulation.motion import protected_integral
+from ssm_decouple.simulation.motion import protected_integral, twist_along
 from ssm_decouple.studies.case import Case
 
 LAWS = ("none", "selective", "reactionless")
@@ -128,14 +128,10 @@ def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[An
     U_c, frame = np.array(json.loads(motion.attrs["case_U_c"])).reshape(6, -1), motion.attrs["case_frame"]
     if np.array_equal(U_c, motion.U_c.values) and frame == json.loads(motion.attrs["law"])["frame"]:
         return motion.protected_rate.values, motion.protected_angle.values
-    from scipy.spatial.transform import Rotation
-
-    twist = [motion.base_linear_velocity.values, motion.base_angular_velocity.values]
-    if frame == "inertial":
-        attitude = Rotation.from_quat(motion.base_quaternion.values)
-        twist = [attitude.apply(part) for part in twist]
+    twists = np.hstack([motion.base_linear_velocity.values, motion.base_angular_velocity.values])
+    rate = twist_along(U_c, frame, twists, motion.base_quaternion.values)
     angle = protected_integral(U_c, frame, motion.base_twist_integral.values, motion.configuration.values)
-    return np.hstack(twist) @ U_c, angle
+    return rate, angle
 
 
 @dataclass(frozen=True)
