@@ -12,6 +12,7 @@ PRINTS = {
     "case2": "converged at 137.2 s, 5.25 mm left",
     "case3": "case3 | selective | 2 | converged, 97 s | 0.70",
     "bending": "protected: bending modes   tip   0.001",
+    "control_loop": "memory held after a step: 0 bytes more than before",
     "own_axis": "of 40 directions can be protected",
     "own_robot": "yaw       converged",
     "pointing": "selective              at most    1.31",
