@@ -595,3 +595,28 @@ def test_the_protected_rate_of_a_dynamic_motion_is_the_truth(ets_vii, frame):
     truth = motion.protected_rate.values[1:-1, 0]
     assert np.abs(truth).max() > 1e-9
     np.testing.assert_allclose(turned, truth, atol=0.02 * np.abs(truth).max())
+
+
+@pytest.mark.parametrize(
+    "protection",
+    [ssm.Protection("yaw"), ssm.Protection("yaw", "inertial"), ssm.Protection.from_modes([6.0, 0, 0, 0, 0, -35.0])],
+    ids=["base", "inertial", "twist"],
+)
+def test_a_servo_that_protects_holds_the_directions_when_the_model_is_off(ets_vii, protection):
+    plant = perturbed(ets_vii, Tolerances(0.05, 0.05, 0.005, 0.005), 4)
+    law = ssm.SelectiveLaw(ets_vii, protection, rate_limit=np.deg2rad(5))
+    q = ets_vii.configuration(np.deg2rad([150, -20, -10, 0, 0, 0]))
+    turned = {}
+    for protects in (False, True):
+        physics = Dynamic(step=0.005, plant=plant, servo=Servo(protects=protects))
+        motion = ssm.simulate(law, q, [-1.8, -0.3, 1.2], 20.0, 0.1, physics)
+        turned[protects] = float(np.abs(motion.protected_angle).max())
+        assert motion.attrs["energy_error"] < 1e-9
+    assert turned[True] < turned[False] / 500
+
+
+def test_feedback_and_a_servo_that_protects_are_one_too_many(ets_vii):
+    law = ssm.SelectiveLaw(ets_vii, ssm.Protection("yaw"))
+    physics = Dynamic(servo=Servo(protects=True), feedback_gain=1.0)
+    with pytest.raises(ssm.InputError, match="would both hold the protected directions; use one"):
+        ssm.simulate(law, ets_vii.configuration(), [1.0, 0.0, 2.0], 1.0, 0.1, physics)

@@ -134,10 +134,43 @@ def test_the_servo_asks_for_accelerations_and_gets_them(robot, rng):
     q, v, wanted = random_state(robot, rng), rng.normal(size=6 + n), rng.normal(size=n)
     torque, none = np.empty(n), np.full(n, np.inf)
     room = physics.scratch_of(n)
-    own = (*tree_of(robot.model), robot.joint_positions(q), v, wanted)
+    own = (*tree_of(robot.model), robot.joint_positions(q), v, wanted, np.zeros((6, 0)), np.zeros(0))
     assert not physics.servo_torque(*own, none, room, torque)
     found = pin.aba(model, model.createData(), q, v, np.r_[np.zeros(6), torque])
     assert relative(found[6:], wanted) < 1e-10
     limits, cut = 0.5 * np.abs(torque), np.empty(n)
     assert physics.servo_torque(*own, limits, room, cut)
     np.testing.assert_allclose(cut, 0.5 * torque)
+
+
+@pytest.mark.parametrize("k", [1, 2, 3])
+def test_a_servo_that_protects_accelerates_the_base_as_asked(robot, rng, k):
+    """By Pinocchio's forward dynamics; and of all joint accelerations that do it, it changes the wanted ones least."""
+    model, n = without_gravity(robot), robot.n_joints
+    k = min(k, n)
+    q, v, wanted = random_state(robot, rng), rng.normal(size=6 + n), rng.normal(size=n)
+    U, asked, torque = np.linalg.qr(rng.normal(size=(6, k)))[0].copy(), rng.normal(size=k), np.empty(n)
+    given = wanted.copy()
+    own = (*tree_of(robot.model), robot.joint_positions(q), v, given, U, asked)
+    physics.servo_torque(*own, np.full(n, np.inf), physics.scratch_of(n), torque)
+    found = pin.aba(model, model.createData(), q, v, np.r_[np.zeros(6), torque])
+    J_sub = U.T @ robot.coupling(q).J_base
+    scale = np.linalg.cond(J_sub) * (1 + np.abs(found).max())
+    assert np.abs(U.T @ found[:6] - asked).max() < 1e-10 * scale
+    assert np.abs(found[6:] - given).max() < 1e-10 * scale
+    # The change lies in the rows of J_sub.
+    change = given - wanted
+    along = np.linalg.lstsq(J_sub.T, change, rcond=None)[0]
+    assert np.abs(J_sub.T @ along - change).max() < 1e-9 * scale
+
+
+def test_directions_that_no_joint_serves_are_left_out(ets_vii, rng):
+    """The same direction twice, asked for two things: the first counts, and nothing overflows."""
+    q, n = ets_vii.configuration(rng.normal(size=6)), 6
+    U = np.zeros((6, 2))
+    U[5] = 1.0
+    given, torque = np.zeros(n), np.empty(n)
+    own = (*tree_of(ets_vii.model), ets_vii.joint_positions(q), np.zeros(12), given, U, np.array([0.1, 0.2]))
+    physics.servo_torque(*own, np.full(n, np.inf), physics.scratch_of(n), torque)
+    found = pin.aba(without_gravity(ets_vii), ets_vii.model.createData(), q, np.zeros(12), np.r_[np.zeros(6), torque])
+    assert found[5] == pytest.approx(0.1, rel=1e-9)

@@ -52,12 +52,16 @@ class Servo:
         period: Longest time between two torques, s; it is shortened to divide the time between samples. None makes a
             new one in each physics step.
         torque_limits: Largest torques (n,), N m, or one number; None takes the URDF's efforts.
+        protects: Whether each torque also holds the base along the protected directions, by what base sensors tell at
+            the drives' own pace: the least change of the joint accelerations that gives the base, along them, the
+            acceleration of a loop with the same frequency and damping. Commands alone protect at the law's pace.
     """
 
     frequency: float = 2.0
     damping_ratio: float = 1.0
     period: float | None = None
     torque_limits: Floats | float | None = None
+    protects: bool = False
 
 
 @dataclass(frozen=True)
@@ -193,7 +197,11 @@ class DynamicMotion:
         self._noise = np.random.default_rng(settings.sensors.seed if settings.sensors else 0)
         self._limits = _torque_limits(robot, settings.servo)
         joints = np.vstack([self.plant.stiffness, self.plant.damping])
-        self._constants = (*tree_of(self.plant.robot.model), joints, self.driven, *tree_of(robot.model), self._limits)
+        protects = settings.servo is not None and settings.servo.protects
+        spared = law.protection.U_twist.copy() if protects else np.zeros((6, 0))
+        self._spared_motion: Floats = np.zeros(spared.shape[1])
+        trees = (*tree_of(self.plant.robot.model), joints, self.driven, *tree_of(robot.model))
+        self._constants = (*trees, self._limits, spared)
         _refuse_coarse_step(settings, self.plant, self.start)
 
     def _positions(self, q: Floats) -> Floats:
@@ -237,12 +245,14 @@ class DynamicMotion:
             FloatingPointError: the motion has diverged; the message says when.
         """
         held, before = _holding(self.settings, t, t_next), self.totals[:6].copy()
+        held[physics.INERTIAL] = float(self.law.protection.frame == "inertial")
         bad = physics.advance(
             *self._constants,
             held,
             np.ascontiguousarray(rates),
             self.reference,
             self.torques,
+            self._spared_motion,
             self.q,
             self.v,
             self.pose,
@@ -375,7 +385,7 @@ def _holding(settings: Dynamic, t: float, t_next: float) -> Floats:
     if settings.load is not None:
         ends = np.array([settings.load.start, settings.load.start + settings.load.duration])
         held[physics.LOAD_FROM : physics.LOAD_TO + 1] = np.clip(np.round((ends - t) / dt * steps), 0, steps)
-        held[physics.LOAD :] = *settings.load.force, *settings.load.torque
+        held[physics.LOAD : physics.INERTIAL] = *settings.load.force, *settings.load.torque
     return held
 
 
@@ -408,6 +418,8 @@ def _refuse_bad_numbers(settings: Dynamic) -> None:
     if settings.sensors is not None:
         for name in ("encoder_noise", "encoder_resolution", "gyro_noise"):
             at_least_zero[name] = getattr(settings.sensors, name)
+    if settings.servo is not None and settings.servo.protects and settings.feedback_gain:
+        raise InputError("feedback_gain and a servo that protects would both hold the protected directions; use one")
     for name, value in positive.items():
         if not (np.isfinite(value) and value > 0):
             raise InputError(f"{name} is {value}; it must be a positive number")

@@ -55,7 +55,8 @@ PRESCRIBED = 5  # 1.0: the joints follow the commands whatever torque it takes
 LOAD_FROM = 6  # the external wrench acts from this physics step, counted from the call,
 LOAD_TO = 7  # up to before this one
 LOAD = 8  # 6: force and torque on the base, at its origin, base axes
-SETTINGS_SIZE = 14
+INERTIAL = 14  # 1.0 if the directions that the servo spares are fixed in inertial axes, 0.0 in base axes
+SETTINGS_SIZE = 15
 
 # Where the running sums stand in `totals`.
 TWIST = 0  # 6: integral of the base twist, base axes
@@ -67,6 +68,7 @@ IMPULSE = 10  # 6: of the external wrench, inertial axes, about the inertial ori
 TOTALS_SIZE = 16
 
 OK = -1  # what `advance` returns unless it has stopped
+SINGULAR = 1e-20  # square of what is left of a row, against the longest, below which the joints cannot serve it
 DIVERGED = 1e4  # rad/s or m/s: no spacecraft moves so fast
 
 
@@ -338,18 +340,83 @@ def add_impulse(
 
 
 @compiled
+def spare_base(M: Floats, bias: Floats, U: Floats, asked: Floats, small: Floats, wanted: Floats) -> None:
+    """Change the accelerations `wanted` (n,) by as little as gives the base U^T v_dot = `asked` (k,).
+
+    With M_bb v_dot + M_bj q_ddot + bias_b = 0 the row U_i^T v_dot is -X_i . (bias_b + M_bj q_ddot), M_bb X_i = U_i.
+    `small` (k, 6 + n) and more is overwritten.
+    """
+    k, n = U.shape[1], wanted.shape[0]
+    lengths, shift = small[k], small[k + 1]
+    largest = 0.0
+    for i in range(k):
+        row, X = small[i], small[k + 2]
+        for c in range(6):
+            X[c] = U[c, i]
+            for d in range(c + 1):
+                small[k + 3 + c, d] = M[c, d]
+        solve_positive(small[k + 3 :], 6, X)
+        shift[i] = asked[i]
+        for c in range(6):
+            shift[i] += X[c] * bias[c]
+        for j in range(n):
+            row[j] = 0.0
+            for c in range(6):
+                row[j] -= X[c] * M[6 + j, c]
+        # Make it orthogonal to the rows before, twice, and its equation with it.
+        whole = 0.0
+        for j in range(n):
+            whole += row[j] * row[j]
+        largest = max(largest, whole)
+        for _ in range(2):
+            for b in range(i):
+                if lengths[b] > 0.0:
+                    product = 0.0
+                    for j in range(n):
+                        product += row[j] * small[b, j]
+                    product /= lengths[b]
+                    for j in range(n):
+                        row[j] -= product * small[b, j]
+                    shift[i] -= product * shift[b]
+        lengths[i] = 0.0
+        for j in range(n):
+            lengths[i] += row[j] * row[j]
+        if lengths[i] <= SINGULAR * largest:  # the joints cannot move the base so: nothing to keep
+            lengths[i] = 0.0
+    for i in range(k):
+        if lengths[i] > 0.0:
+            missing = shift[i]
+            for j in range(n):
+                missing -= small[i, j] * wanted[j]
+            for j in range(n):
+                wanted[j] += small[i, j] * missing / lengths[i]
+
+
+@compiled
 def servo_torque(
-    parent: Ints, tree: Floats, q: Floats, v: Floats, wanted: Floats, limits: Floats, work: Floats, torque: Floats
+    parent: Ints,
+    tree: Floats,
+    q: Floats,
+    v: Floats,
+    wanted: Floats,
+    U: Floats,
+    asked: Floats,
+    limits: Floats,
+    work: Floats,
+    torque: Floats,
 ) -> bool:
     """Fill `torque` (n,) with what gives the joints the accelerations `wanted` (n,) while the base floats.
 
-    Computed torque by the controller's own model. Return whether a limit (n,) cut one of them. `work`, as large as
-    `scratch_of` says, is overwritten.
+    Computed torque by the controller's own model. With directions U (6, k) of the base twist the accelerations are
+    changed, in place, so that the base accelerates along them as `asked` (k,). Return whether a limit (n,) cut a
+    torque. `work`, as large as `scratch_of` says, is overwritten.
     """
     n = wanted.shape[0]
     bodies, M, small = work[: n + 1], work[n + 1 : 2 * n + 7], work[2 * n + 7 :]
-    bias, change, x = small[6], small[7], small[8]
+    bias, change, x = small[20], small[21], small[22]
     equations(parent, tree, q, v, bodies, M, bias)
+    if U.shape[1] > 0:
+        spare_base(M, bias, U, asked, small, wanted)
     for i in range(6):
         x[i] = -bias[i]
         for j in range(n):
@@ -371,9 +438,21 @@ def servo_torque(
 
 
 @compiled
+def rows_in_base(U: Floats, pose: Floats, inertial: bool, out: Floats) -> None:
+    """Fill `out` (6, k) with directions of the base twist (6, k) in base axes, given in base or inertial axes."""
+    for i in range(U.shape[1]):
+        for c in range(6):
+            out[c, i] = U[c, i]
+        if inertial:
+            for c in range(3):
+                out[c, i] = pose[c] * U[0, i] + pose[3 + c] * U[1, i] + pose[6 + c] * U[2, i]
+                out[3 + c, i] = pose[c] * U[3, i] + pose[3 + c] * U[4, i] + pose[6 + c] * U[5, i]
+
+
+@compiled
 def scratch_of(n: int) -> Floats:
     """Return room for the equations of a tree of n joints and for solving them."""
-    return np.empty((3 * n + 16, max(BODIES_SIZE, n + 6)))
+    return np.empty((3 * n + 32, max(BODIES_SIZE, n + 6)))
 
 
 @compiled
@@ -469,7 +548,8 @@ def split(driven: Ints, size: int, prescribed: bool) -> tuple[Ints, Ints]:
 _INTS, _ROWS, _VECTOR = "int64[::1]", "float64[:, ::1]", "float64[::1]"
 ADVANCE = (
     f"int64({_INTS}, {_ROWS}, {_ROWS}, {_INTS}, {_INTS}, {_ROWS}, "
-    f"{_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_ROWS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR})"
+    f"{_VECTOR}, {_ROWS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_ROWS}, "
+    f"{_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR})"
 )
 
 
@@ -482,10 +562,12 @@ def advance(
     own_parent: Ints,
     own_tree: Floats,
     limits: Floats,
+    U: Floats,
     settings: Floats,
     command: Floats,
     reference: Floats,
     torques: Floats,
+    spared_motion: Floats,
     q: Floats,
     v: Floats,
     pose: Floats,
@@ -503,10 +585,12 @@ def advance(
         own_parent: As `parent`, of the controller's model (n,).
         own_tree: As `tree`, of the controller's model (n + 1, TREE_SIZE).
         limits: Torque limits (n,), infinite where there is none.
+        U: Directions of the base twist that the servo spares (6, k), k may be 0.
         settings: (SETTINGS_SIZE,), by the indices above.
         command: Joint rates (n,), held.
         reference: Where the commands have led the joints so far (n,), overwritten.
         torques: (2, n): the torques that act at last, and the largest ones so far, overwritten.
+        spared_motion: How far the base has moved along U so far (k,), overwritten.
         q: Joint positions (N,), overwritten.
         v: Base twist and joint rates (6 + N,), overwritten.
         pose: Base rotation by rows and position (12,), overwritten.
@@ -524,6 +608,8 @@ def advance(
     power, flows, load = np.empty(3), np.empty(3), np.zeros(6)
     u, k, sum_u, R, sum_p, p_dot = np.zeros(3), np.empty(3), np.empty(3), np.empty(9), np.empty(3), np.empty(3)
     own_q, own_v, wanted = np.empty(n), np.empty(6 + n), np.empty(n)
+    spared = U.shape[1]
+    U_base, asked, moved = np.empty((6, spared)), np.empty(spared), np.empty(6)
     if prescribed:
         totals[WORK] += jump(parent, tree, free, given, driven, command, q, v, work, change)
     cut = False
@@ -536,7 +622,12 @@ def advance(
                 own_q[j], own_v[6 + j] = q[driven[j]], v[6 + driven[j]]
                 wanted[j] = 2.0 * settings[RATIO] * settings[FREQUENCY] * (command[j] - own_v[6 + j])
                 wanted[j] += settings[FREQUENCY] ** 2 * (reference[j] - own_q[j])
-            cut = servo_torque(own_parent, own_tree, own_q, own_v, wanted, limits, own_work, torques[0])
+            rows_in_base(U, pose, settings[INERTIAL] > 0.0, U_base)
+            for i in range(spared):
+                asked[i] = -(settings[FREQUENCY] ** 2) * spared_motion[i]
+                for c in range(6):
+                    asked[i] -= 2.0 * settings[RATIO] * settings[FREQUENCY] * U_base[c, i] * v[c]
+            cut = servo_torque(own_parent, own_tree, own_q, own_v, wanted, U_base, asked, limits, own_work, torques[0])
             for j in range(n):
                 if not cut:  # while a drive stands at its limit the reference waits, or it would run away
                     reference[j] += span * command[j]
@@ -596,7 +687,13 @@ def advance(
             for i in range(N):
                 sum_q[i] += weight * v_stage[6 + i]
             for c in range(6):
-                totals[TWIST + c] += weight * v_stage[c]
+                moved[c] = (moved[c] if stage > 0 else 0.0) + weight * v_stage[c]
+        if spared > 0:
+            rows_in_base(U, pose, settings[INERTIAL] > 0.0, U_base)
+        for c in range(6):
+            totals[TWIST + c] += moved[c]
+            for i in range(spared):
+                spared_motion[i] += U_base[c, i] * moved[c]
         turn(pose[:9], sum_u, R)
         for c in range(9):
             pose[c] = R[c]

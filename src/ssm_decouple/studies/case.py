@@ -35,8 +35,9 @@ Floats = NDArray[np.float64]
 _FOLDER = Path(__file__).parent / "cases"
 
 # What a case file may hold: table, key, what the value must be, and whether it has to be there.
-_NUMBER, _TEXT, _NUMBERS, _JOINTS, _AXES, _TURNS = (
+_NUMBER, _SWITCH, _TEXT, _NUMBERS, _JOINTS, _AXES, _TURNS = (
     "a number",
+    "true or false",
     "a text",
     "3 numbers",
     "a list of numbers or a table by joint name",
@@ -76,6 +77,7 @@ _SCHEMA: dict[str, dict[str, tuple[str, bool]]] = {
         "servo_frequency": (_NUMBER, False),
         "servo_damping_ratio": (_NUMBER, False),
         "servo_period": (_NUMBER, False),
+        "servo_protects": (_SWITCH, False),
         "feedback_gain": (_NUMBER, False),
     },
     "spacecraft": {"turned_deg": (_TURNS, False)},
@@ -324,6 +326,8 @@ def _fits(value: Any, kind: str) -> bool:
 
     if kind == _NUMBER:
         return number(value)
+    if kind == _SWITCH:
+        return isinstance(value, bool)
     if kind == _TEXT:
         return isinstance(value, str)
     if kind == _NUMBERS:

@@ -11,7 +11,7 @@ import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.momentum.protection import Protection
-from ssm_decouple.simulation.dynamic import Dynamic
+from ssm_decouple.simulation.dynamic import Dynamic, Servo
 from ssm_decouple.studies.case import Case
 
 Floats = NDArray[np.float64]
@@ -25,7 +25,8 @@ class Pointing:
 
     Attributes:
         case: Name of the case.
-        law: "none", "selective" (the line of sight protected) or "reactionless"; "planned" with three hold nodes.
+        law: "none", "selective" (the line of sight protected) or "reactionless"; "planned" with three hold nodes,
+            "in the servo" with drives that protect too.
         k: Protected directions.
         peak_arcsec: Largest angle between the line of sight and where it looked at the start.
         rms_arcsec: The same, root mean square over the motion.
@@ -83,19 +84,22 @@ def pointing(
         InputError: the boresight is zero or not finite.
     """
     sight = Protection.boresight(boresight)
+    physics = physics or Dynamic()
+    in_servo = replace(physics, servo=replace(physics.servo or Servo(), protects=True))
     laws = {
-        "none": (Protection("none"), 0),
-        "selective": (sight, 0),
-        "selective, planned": (sight, 3),
-        "reactionless": (Protection("all"), 0),
-        "reactionless, planned": (Protection("all"), 3),
+        "none": (Protection("none"), 0, physics),
+        "selective": (sight, 0, physics),
+        "selective, planned": (sight, 3, physics),
+        "selective, in the servo": (sight, 0, in_servo),
+        "reactionless": (Protection("all"), 0, physics),
+        "reactionless, planned": (Protection("all"), 3, physics),
     }
-    for name, (protection, nodes) in laws.items():
+    for name, (protection, nodes, method) in laws.items():
         variant = replace(
             case,
             protection=sight,
             law={**case.law, "hold_nodes": nodes},
-            simulation={**case.simulation, "method": physics or Dynamic()},
+            simulation={**case.simulation, "method": method},
         )
         motion = variant.run(protection, progress=None if progress is None else partial(progress, name))
         error = ARCSEC * pointing_error(motion, boresight)

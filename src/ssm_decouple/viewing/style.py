@@ -32,6 +32,7 @@ LAW_LINES: dict[str, dict[str, Any]] = {
 }
 LAW_LINES |= {
     "selective, planned": {"color": "#CC79A7", "linestyle": (0, (4, 1))},
+    "selective, in the servo": {"color": "#0072B2", "linestyle": "-"},
     "reactionless, planned": {"color": "#E69F00", "linestyle": (0, (4, 1))},
     "the case's own": LAW_LINES["selective"],
     "bending modes": {"color": "#0072B2", "linestyle": "-"},

@@ -92,9 +92,9 @@ def pointing_table(rows: Sequence[Pointing]) -> list[list[str]]:
             row.case,
             row.law,
             str(row.k),
-            f"{row.peak_arcsec:.4f}",
-            f"{row.rms_arcsec:.4f}",
-            f"{row.end_arcsec:.4f}",
+            f"{row.peak_arcsec:.3g}",
+            f"{row.rms_arcsec:.3g}",
+            f"{row.end_arcsec:.3g}",
             f"{row.outcome}, {row.outcome_time_s:.0f} s",
             f"{1e3 * row.final_error_m:.1f}",
         ]
