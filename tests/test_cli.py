@@ -162,7 +162,7 @@ def test_a_target_out_of_reach_warns_and_runs(write, tmp_path):
 
 
 def test_ctrl_c_keeps_what_is_done(short_case, write, tmp_path):
-    endless = write(short_case.read_text().replace("duration = 2 ", "duration = 1e6 "), "endless.toml")
+    endless = write(short_case.read_text().replace("duration = 2 ", "duration = 1e5 "), "endless.toml")
     words = [*COMMAND, "run", str(short_case), str(endless), "--no-figures", "-o", str(tmp_path / "out")]
     process = subprocess.Popen(
         words,
@@ -174,15 +174,15 @@ def test_ctrl_c_keeps_what_is_done(short_case, write, tmp_path):
     deadline = time.monotonic() + 60
     while not (tmp_path / "out" / "short" / "selective.nc").exists() and time.monotonic() < deadline:
         time.sleep(0.05)
-    time.sleep(1.0)
+    time.sleep(3.0)
     os.kill(process.pid, signal.SIGINT)
     out, err = process.communicate(timeout=60)
     assert process.returncode == 130, err
     assert "interrupted: 1 finished motions are kept" in err
     assert "short" in out
     partial = ssm.load_motion(tmp_path / "out" / "interrupted.nc")
-    assert partial.attrs["outcome"] in ("running", "converged")
-    assert 2 < partial.time.values[-1] < 1e6
+    assert partial.attrs["outcome"] in ("running", "converged", "stalled")
+    assert 2 < partial.time.values[-1] < 1e5
     assert not list(Path(tmp_path).rglob("*.part*"))
 
 
@@ -241,3 +241,19 @@ def test_drives_that_are_too_weak_are_told_with_their_times(write, tmp_path):
     assert done.returncode == 3, done.stderr
     assert "weak, selective: drives at their torque limits for" in done.stdout
     assert "0.0 to " in done.stdout
+
+
+def test_a_case_that_a_study_refuses_stops_it_before_it_starts(short_case, write, tmp_path):
+    bare = write(short_case.read_text().replace("axes = [[0, 0, 1]]", 'axes = "none"'), "bare.toml")
+    assert 'axes = "none"' in bare.read_text()
+    done = call("study", "robustness", short_case, bare, "-o", tmp_path / "out", "--runs", "1", "--levels", "5")
+    assert done.returncode == 1
+    assert "case 'bare' needs a protection of rotation" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_part_that_the_robot_does_not_have_cannot_be_turned(short_case, write):
+    path = write(short_case.read_text() + "\n[spacecraft]\nturned_deg = { wing_lft = 30 }\n", "typo.toml")
+    done = call("run", path, "--no-figures")
+    assert done.returncode == 1
+    assert "unknown part 'wing_lft'; did you mean 'wing_left'?" in done.stderr

@@ -36,3 +36,38 @@ def as_floats(name: str, value: ArrayLike) -> NDArray[np.float64]:
         return np.array(value, dtype=float)
     except (TypeError, ValueError, OverflowError):
         raise InputError(f"{name} is {value!r}; it needs real numbers") from None
+
+
+def as_positive(name: str, value: float) -> float:
+    """Return a number that has to be finite and above zero.
+
+    Raises:
+        InputError: it is not; the message calls it `name`.
+    """
+    number = as_floats(name, value)
+    if number.shape != () or not (np.isfinite(number) and number > 0):
+        raise InputError(f"{name} is {value!r}; it must be a positive number")
+    return float(number)
+
+
+def as_not_negative(name: str, value: float) -> float:
+    """Return a number that has to be finite and not below zero.
+
+    Raises:
+        InputError: it is not; the message calls it `name`.
+    """
+    number = as_floats(name, value)
+    if number.shape != () or not (np.isfinite(number) and number >= 0):
+        raise InputError(f"{name} is {value!r}; it must be zero or a positive number")
+    return float(number)
+
+
+def as_seed(name: str, value: int) -> int:
+    """Return the seed of a random generator.
+
+    Raises:
+        InputError: it is no whole number from 0; the message calls it `name`.
+    """
+    if not isinstance(value, int) or isinstance(value, bool) or value < 0:
+        raise InputError(f"{name} is {value!r}; it must be a whole number from 0")
+    return value

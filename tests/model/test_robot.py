@@ -243,3 +243,11 @@ def test_random_trees_load_with_every_kind_of_joint():
     kinds = {word for seed in range(8) for word in ("continuous", "prismatic", "fixed") if word in random_urdf(seed)}
     assert kinds == {"continuous", "prismatic", "fixed"}
     assert random_robot(3, joints=7).n_joints == 7
+
+
+def test_nothing_pulls_on_the_robot(robot):
+    """Pinocchio's own gravity would be in everything that a user computes with `robot.model`."""
+    import pinocchio as pin
+
+    model = robot.model
+    assert np.all(pin.nle(model, model.createData(), robot.configuration(), np.zeros(model.nv)) == 0.0)

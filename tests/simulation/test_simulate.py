@@ -358,7 +358,7 @@ def test_a_target_out_of_reach_warns_by_how_much_and_runs(ets_vii):
         ({"target": [0, 0]}, "it needs 3 finite numbers"),
         ({"arrival_tolerance": 0.0}, "arrival_tolerance is 0.0"),
         ({"q": np.zeros(13)}, "length 0, not 1"),
-        ({"smooth_start": -1.0}, "smooth_start is -1.0; it must be zero or a positive time"),
+        ({"smooth_start": -1.0}, "smooth_start is -1.0; it must be zero or a positive number"),
         ({"smooth_start": np.inf}, "smooth_start is inf"),
         ({"smooth_start": np.nan}, "smooth_start is nan"),
     ],

@@ -107,3 +107,29 @@ def test_the_table_and_the_figure_tell_the_rows(found):
     np.testing.assert_allclose(top.lines[0].get_ydata(), symmetric)
     assert np.all(envelope.lines[0].get_ydata() >= np.abs(symmetric) - 1e-12)
     assert "mm" in top.get_ylabel()
+
+
+def test_wings_described_with_opposite_normals_have_the_same_parts(found):
+    case, runs = found
+    left, right = case.robot.appendages
+    same = replace(right, turn=np.pi)  # the same plate, its normal the other way
+    other = replace(case)
+    other.__dict__["robot"] = case.robot.with_appendages([left, same])
+    tips = runs["none"][1].tip_deflection.values
+    for before, after in zip(parts_of(case, tips), parts_of(other, tips * [1, -1]), strict=True):
+        np.testing.assert_allclose(before, after, atol=1e-15)
+    other.__dict__["robot"] = case.robot.with_appendages([left, replace(right, turn=np.pi / 2)])
+    assert parts_of(other, tips) == (None, None)
+
+
+@pytest.mark.parametrize("frame", ["base", "inertial"])
+def test_the_rotation_that_is_told_is_that_of_the_motion(frame):
+    """In any frame, and with metres left out of it."""
+    case = replace(ssm.load_case("case1"), duration=10.0, base_rpy=(np.pi / 2, 0.0, 0.0))
+    turned = replace(case, protection=ssm.Protection("yaw", frame))
+    row, motion = {row.protection: (row, motion) for row, motion in bending(turned)}["the case's own"]
+    assert row.protected_angle_deg == pytest.approx(float(np.rad2deg(np.abs(motion.protected_angle).max())), rel=1e-12)
+    twisted = replace(case, protection=ssm.Protection(np.eye(6)[:, [0, 5]]))
+    row, motion = {row.protection: (row, motion) for row, motion in bending(twisted)}["none"]
+    yaw = np.abs(motion.base_twist_integral.sel(twist="wz")).max()
+    assert row.protected_angle_deg == pytest.approx(float(np.rad2deg(yaw)), rel=1e-12)

@@ -102,6 +102,8 @@ def test_the_table_and_the_figure_tell_the_rows(campaign):
         ({"levels": (5.0,)}, "0.05 for 5 %"),
         ({"runs": 0}, "0 runs are no study"),
         ({"feedback_gain": 0.0}, "feedback_gain is 0.0"),
+        ({"workers": 0}, "0 workers do nothing"),
+        ({"seed": -1}, "seed is -1"),
     ],
 )
 def test_what_makes_no_study_is_refused(change, words):
@@ -111,5 +113,5 @@ def test_what_makes_no_study_is_refused(change, words):
 
 def test_a_case_that_protects_nothing_is_refused():
     case = replace(ssm.load_case("case1"), protection=ssm.Protection("none"))
-    with pytest.raises(ssm.InputError, match="needs a protection that is fixed in base axes"):
+    with pytest.raises(ssm.InputError, match="needs a protection of rotation: one to three directions"):
         Robustness(case)

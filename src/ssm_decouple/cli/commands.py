@@ -55,7 +55,7 @@ app.add_typer(study, name="study")
 
 _PROTECT = (
     "Protect this instead of the case's own axes: none, roll, pitch, yaw, all, several as 'roll+yaw', or numbers as "
-    "'0.5,0,0.866' or '1,0,0;0,0,1'; add '@inertial' for inertial axes."
+    "'0.5,0,0.866' or '1,0,0;0,0,1', six each for the base twist [linear; angular]; add '@inertial' for inertial axes."
 )
 Dynamics = Annotated[
     bool, typer.Option("--dynamic", help="Solve the equations of motion, the joints driven by torques.")

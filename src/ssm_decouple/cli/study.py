@@ -25,7 +25,7 @@ from ssm_decouple.cli.shared import (
     print_table,
     progress_bar,
 )
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import DecoupleError, InputError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -92,9 +92,10 @@ def study_bending(
     from ssm_decouple.viewing import figures
     from ssm_decouple.viewing.table import bending_table
 
+    bendable = [flexible(case) for case in load(cases)]
     work = _Study("bending", output, no_figures, as_json)
     with work.collecting(), progress_bar(no_progress or as_json) as show:
-        for case in map(flexible, load(cases)):
+        for case in bendable:
             motions = {}
             runs = bending(case, Servo() if torque else None, smooth_start, progress=partial(show, case.name))
             for row, motion in runs:
@@ -154,8 +155,9 @@ def study_robustness(
 ) -> None:
     """What is left of the protection when masses, inertias, centres of mass and mounts are off; and single causes.
 
-    At p per cent, masses and inertias are off by up to p per cent and lengths by up to p mm. Without feedback and
-    with J_sub q_dot = -K theta. Writes OUTPUT/robustness.csv, effects.csv and a figure. Some minutes a case.
+    At p per cent, masses are off by up to p per cent, inertias by up to p per cent beside their mass, and lengths by
+    up to p mm. Without feedback and with J_sub q_dot = -K theta. Writes OUTPUT/robustness.csv, effects.csv and a
+    figure. Some minutes a case.
 
     Example: ssm-decouple study robustness case1 --runs 20
     """
@@ -165,10 +167,11 @@ def study_robustness(
     from ssm_decouple.viewing.table import effect_table, leak_table
 
     shares = [0.01 * level for level in _numbers("levels", levels)]
+    campaigns = [Robustness(case, shares, runs, feedback_gain, seed, workers) for case in load(cases)]
     work, single = _Study("robustness", output, no_figures, as_json), []
     with work.collecting(), progress_bar(no_progress or as_json) as show:
-        for case in load(cases):
-            campaign = Robustness(case, shares, runs, feedback_gain, seed, workers)
+        for campaign in campaigns:
+            case = campaign.case
             try:
                 campaign.run(partial(show, case.name, "random plants"))
             finally:  # what was done before Ctrl-C counts
@@ -200,14 +203,24 @@ class _Study:
         self.rows: list[Any] = []
         self.files: list[Path] = []
         self.interrupted = False
+        self.error: DecoupleError | None = None
 
     @contextmanager
     def collecting(self) -> Iterator[None]:
-        """Turn Ctrl-C into an orderly end."""
+        """Turn Ctrl-C and errors into an orderly end: what was finished before is written first."""
+        from ssm_decouple.simulation.simulate import DivergenceError
+
         try:
             yield
         except KeyboardInterrupt:
             self.interrupted = True
+        except DivergenceError as stopped:
+            from ssm_decouple.simulation.motion import save_motion
+
+            self.files.append(save_motion(stopped.motion, self.folder / "diverged.nc"))
+            self.error = stopped
+        except DecoupleError as error:
+            self.error = error
 
     def keep_motion(self, case: Case, law: str, motion: xr.Dataset) -> None:
         from ssm_decouple.files import writable_folder
@@ -240,8 +253,11 @@ class _Study:
                     typer.echo(heading)
                     print_table(plain(lines))
             typer.echo(f"{len(self.files)} files in {self.folder}")
+        if self.error is not None:
+            raise self.error
         if self.interrupted:
-            complain("[bold yellow]interrupted:[/] what was finished before is kept")
+            kept = "what was finished before is kept" if self.files else "nothing was finished before"
+            complain(f"[bold yellow]interrupted:[/] {kept}")
             raise typer.Exit(INTERRUPTED)
 
 

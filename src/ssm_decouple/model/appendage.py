@@ -82,6 +82,10 @@ class Appendage:
             raise self._error("segments", "it must be a whole number from 1")
         if not np.isfinite(self._number("turn")):
             raise self._error("turn", "it must be a finite angle, rad")
+        if abs(self.turn) > 2 * np.pi:
+            raise self._error(
+                "turn", f"more than a whole turn; in rad, {self.turn:g} deg are {np.deg2rad(self.turn):.4g}"
+            )
         object.__setattr__(self, "segments", int(self.segments))
         object.__setattr__(self, "mount", tuple(map(float, self._vector("mount"))))
         span, normal = self._direction("span_direction"), self._direction("normal")

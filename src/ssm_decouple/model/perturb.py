@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import InputError, as_floats, as_seed
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.model.urdf import parse_urdf, root_link
 
@@ -38,9 +38,11 @@ class Tolerances:
             InputError: a negative number, or a relative one of 1 or more.
         """
         for name, largest in (("mass", 1.0), ("inertia", 1.0), ("centre_of_mass", np.inf), ("mount", np.inf)):
-            value = getattr(self, name)
-            if not (np.isfinite(value) and 0 <= value < largest):
-                raise InputError(f"tolerance of {name} is {value}; it must be at least 0 and below {largest:g}")
+            value = as_floats(f"tolerance of {name}", getattr(self, name))
+            if value.shape != () or not (np.isfinite(value) and 0 <= value < largest):
+                raise InputError(
+                    f"tolerance of {name} is {getattr(self, name)}; it must be at least 0 and below {largest:g}"
+                )
 
 
 def perturbed(robot: Robot, tolerances: Tolerances, seed: int | np.random.Generator) -> Robot:
@@ -55,8 +57,11 @@ def perturbed(robot: Robot, tolerances: Tolerances, seed: int | np.random.Genera
 
     Raises:
         ModelError: the result cannot be simulated.
+        InputError: no tolerances, or a seed that is no whole number from 0.
     """
-    rng = np.random.default_rng(seed)
+    if not isinstance(tolerances, Tolerances):
+        raise InputError(f"tolerances is {tolerances!r}; give a Tolerances, such as Tolerances(mass=0.05)")
+    rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(as_seed("seed", seed))
     root = parse_urdf(robot.urdf, robot.name)
     for inertial in root.findall("link/inertial"):
         _disturb_body(inertial, tolerances, rng)

@@ -79,6 +79,7 @@ class Robot:
             self.model: pin.Model = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
         except (ValueError, RuntimeError) as error:
             raise ModelError(f"robot '{name}': Pinocchio cannot read it: {error}") from error
+        self.model.gravity.setZero()  # Pinocchio's own default would be in whatever a user computes with the model
         self._refuse_lost_mass(root)
         self._data: pin.Data = self.model.createData()
         self._neutral: Floats = pin.neutral(self.model)

@@ -12,7 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError, as_floats
+from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_positive, as_seed
 from ssm_decouple.model.plant import Plant
 from ssm_decouple.model.robot import UNLIMITED, Robot
 from ssm_decouple.simulation import physics
@@ -44,7 +44,7 @@ class Servo:
     """The joint drives: computed torque, by the model that the law has, with a loop on position and rate.
 
     Each joint answers to the commanded rates like the same second-order system, so that the joint rates stay weighted
-    means of commands: what the drives' lag costs the protection is of the order of the lag times the change of J_sub.
+    means of commands: what the drives' lag costs the protection falls with about the square of the frequency.
 
     Attributes:
         frequency: Natural frequency, Hz.
@@ -63,6 +63,12 @@ class Servo:
     torque_limits: Floats | float | None = None
     protects: bool = False
 
+    def __post_init__(self) -> None:
+        as_positive("servo frequency", self.frequency)
+        as_positive("servo damping_ratio", self.damping_ratio)
+        if self.period is not None:
+            as_positive("servo period", self.period)
+
 
 @dataclass(frozen=True)
 class Sensors:
@@ -79,6 +85,11 @@ class Sensors:
     encoder_resolution: float = 0.0
     gyro_noise: float = 0.0
     seed: int = 0
+
+    def __post_init__(self) -> None:
+        for name in ("encoder_noise", "encoder_resolution", "gyro_noise"):
+            as_not_negative(name, getattr(self, name))
+        as_seed("seed of the sensors", self.seed)
 
 
 @dataclass(frozen=True)
@@ -97,6 +108,16 @@ class Load:
     start: float = 0.0
     duration: float = np.inf
 
+    def __post_init__(self) -> None:
+        wrench = as_floats("load force", self.force), as_floats("load torque", self.torque)
+        if any(part.shape != (3,) or not np.all(np.isfinite(part)) for part in wrench):
+            raise InputError(f"load is {self}; force and torque need 3 finite numbers each")
+        as_not_negative("start of the load", self.start)
+        if not float(as_floats("duration of the load", self.duration)) > 0:
+            raise InputError(f"duration of the load is {self.duration}; it must be above zero, s, or infinite")
+        for name, part in zip(("force", "torque"), wrench, strict=True):
+            object.__setattr__(self, name, tuple(part.tolist()))
+
 
 @dataclass(frozen=True)
 class Dynamic:
@@ -111,7 +132,7 @@ class Dynamic:
         sensors: What the law sees; None is the truth.
         load: What acts from outside; None is nothing, so that momentum is conserved.
         feedback_gain: K, 1/s, of J_sub q_dot = -K theta, with theta the rotation about the protected axes as the
-            gyros tell it; 0 for no feedback.
+            gyros tell it; 0 for no feedback. K times the time between samples has to stay below 1, or it overshoots.
     """
 
     step: float = 1e-3
@@ -120,6 +141,19 @@ class Dynamic:
     sensors: Sensors | None = None
     load: Load | None = None
     feedback_gain: float = 0.0
+
+    def __post_init__(self) -> None:
+        as_positive("physics step", self.step)
+        as_not_negative("feedback_gain", self.feedback_gain)
+        kinds = {"servo": Servo, "plant": Robot, "sensors": Sensors, "load": Load}
+        for name, kind in kinds.items():
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise InputError(f"{name} is {value!r}; give a {kind.__name__}, or None")
+        if self.servo is not None and self.servo.protects and self.feedback_gain:
+            raise InputError(
+                "feedback_gain and a servo that protects would both hold the protected directions; use one"
+            )
 
     def describe(self) -> dict[str, Any]:
         """Return the settings in plain types, for a record."""
@@ -167,13 +201,14 @@ class DynamicMotion:
         settings: The physics.
         law: The law that commands it.
         q: Start configuration of the law's robot (nq,); everything is at rest and the appendages are straight.
+        dt: Time between samples, s.
 
     Raises:
         InputError: a number that makes no sense, another robot's joints, or a physics step that is too long.
     """
 
-    def __init__(self, settings: Dynamic, law: SelectiveLaw, q: Floats) -> None:
-        _refuse_bad_numbers(settings)
+    def __init__(self, settings: Dynamic, law: SelectiveLaw, q: Floats, dt: float = 0.0) -> None:
+        _refuse_unfit_feedback(settings, law, dt)
         self.settings, self.law = settings, law
         robot = law.robot
         self.plant = Plant.of(settings.plant or robot)
@@ -409,31 +444,17 @@ def _refuse_other_joints(robot: Robot, rigid: Robot) -> None:
         )
 
 
-def _refuse_bad_numbers(settings: Dynamic) -> None:
-    positive, at_least_zero = {"physics step": settings.step}, {"feedback_gain": settings.feedback_gain}
-    if settings.servo is not None:
-        positive |= {"servo frequency": settings.servo.frequency, "servo damping_ratio": settings.servo.damping_ratio}
-        if settings.servo.period is not None:
-            positive["servo period"] = settings.servo.period
-    if settings.sensors is not None:
-        for name in ("encoder_noise", "encoder_resolution", "gyro_noise"):
-            at_least_zero[name] = getattr(settings.sensors, name)
-    if settings.servo is not None and settings.servo.protects and settings.feedback_gain:
-        raise InputError("feedback_gain and a servo that protects would both hold the protected directions; use one")
-    for name, value in positive.items():
-        if not (np.isfinite(value) and value > 0):
-            raise InputError(f"{name} is {value}; it must be a positive number")
-    for name, value in at_least_zero.items():
-        if not (np.isfinite(value) and value >= 0):
-            raise InputError(f"{name} is {value}; it must be zero or a positive number")
-    if settings.load is not None:
-        wrench = as_floats("load force", settings.load.force), as_floats("load torque", settings.load.torque)
-        if any(part.shape != (3,) or not np.all(np.isfinite(part)) for part in wrench):
-            raise InputError(f"load is {settings.load}; force and torque need 3 finite numbers each")
-        if not (settings.load.start >= 0 and settings.load.duration > 0):
-            raise InputError(
-                f"load starts at {settings.load.start} s for {settings.load.duration} s; give positive times"
-            )
+def _refuse_unfit_feedback(settings: Dynamic, law: SelectiveLaw, dt: float) -> None:
+    if settings.feedback_gain * dt > 1:
+        raise InputError(
+            f"feedback_gain is {settings.feedback_gain:g} 1/s, with {dt:g} s between samples it overshoots: use "
+            f"{1 / dt:.3g} 1/s or less"
+        )
+    if settings.feedback_gain and np.any(law.protection.U_twist[:3]):
+        raise InputError(
+            "feedback_gain takes back what gyros tell, and the protection has rows of translation, which they do not; "
+            "use a servo that protects, or protect rotation alone"
+        )
 
 
 def _refuse_coarse_step(settings: Dynamic, plant: Plant, q: Floats) -> None:

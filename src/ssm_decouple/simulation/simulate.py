@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import AT_REST, SelectiveLaw
-from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_floats
+from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_floats, as_not_negative
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import build_motion, judge
 from ssm_decouple.simulation.steps import STEPS, Pace, Reference
@@ -133,7 +133,7 @@ class _Run:
         self, law: SelectiveLaw, start: Floats, time: Floats, reference: Reference, pace: Pace, method: Method | Dynamic
     ) -> None:
         self.law, self.time, self.reference, self.pace, self.method = law, time, reference, pace, method
-        self.dynamic = DynamicMotion(method, law, start) if isinstance(method, Dynamic) else None
+        self.dynamic = DynamicMotion(method, law, start, time[1] - time[0]) if isinstance(method, Dynamic) else None
         # A command that is held speaks for the middle of its hold, one of the continuous law for its own time.
         holds = np.diff(time, append=2 * time[-1] - time[-2])
         self.leads = np.zeros(time.size) if method == "rk4" else 0.5 * holds
@@ -212,8 +212,7 @@ def _refuse_unfit_method(law: SelectiveLaw, method: Method | Dynamic, duration: 
 
 
 def _smooth_pace(duration: float) -> Pace:
-    if not (np.isfinite(duration) and duration >= 0):
-        raise InputError(f"smooth_start is {duration}; it must be zero or a positive time, s")
+    duration = as_not_negative("smooth_start", duration)
 
     def pace(time: float) -> float:
         if time >= duration:

@@ -13,8 +13,10 @@ from ssm_decouple.errors import InputError
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.dynamic import Dynamic, Servo
 from ssm_decouple.studies.case import Case
+from ssm_decouple.studies.comparison import largest_rotation_deg
 
 FLEXIBLE = "ets_vii_flexible"
+PARALLEL = 0.99  # cosine between two panels' normals from which on they bend together or against each other
 
 
 @dataclass(frozen=True)
@@ -32,7 +34,8 @@ class Bending:
         outcome: "converged", "stalled" or "running".
         outcome_time_s: When.
         final_error_m: Distance to the target at the end.
-        protected_angle_deg: Largest true rotation about the directions that the case itself protects.
+        protected_angle_deg: Largest true rotation about the directions that the case itself protects; of rows of the
+            whole twist, their angular part.
         energy_error: Of the simulation, relative.
         momentum_drift: The same.
     """
@@ -114,7 +117,6 @@ def summarise_bending(case: Case, name: str, motion: xr.Dataset) -> Bending:
     """Return a motion with bending appendages in figures."""
     tips = 1e3 * motion.tip_deflection.values
     symmetric, antisymmetric = parts_of(case, tips)
-    turned = motion.base_twist_integral.values @ case.protection.U_twist
     return Bending(
         case=case.name,
         protection=name,
@@ -125,7 +127,7 @@ def summarise_bending(case: Case, name: str, motion: xr.Dataset) -> Bending:
         outcome=motion.attrs["outcome"],
         outcome_time_s=float(motion.attrs["outcome_time"]),
         final_error_m=float(motion.attrs["final_error"]),
-        protected_angle_deg=float(np.rad2deg(np.abs(turned).max(initial=0.0))),
+        protected_angle_deg=largest_rotation_deg(motion, case.protection),
         energy_error=float(motion.attrs["energy_error"]),
         momentum_drift=float(motion.attrs["momentum_drift"]),
     )
@@ -134,9 +136,15 @@ def summarise_bending(case: Case, name: str, motion: xr.Dataset) -> Bending:
 def parts_of(
     case: Case, tips: np.ndarray[tuple[int, ...], np.dtype[np.float64]]
 ) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.float64]] | None, ...]:
-    """Return the symmetric and the antisymmetric part of two tips' deflections (m, 2), each (m,); None of others."""
+    """Return the symmetric and antisymmetric parts (m,) of two tips' deflections (m, 2), along the first normal.
+
+    None where there are not two, or their panels do not face the same way.
+    """
     wings = case.robot.appendages
     if len(wings) != 2:
         return None, None
-    second = tips[:, 1] * np.sign(np.dot(wings[0].normal, wings[1].normal))
+    aligned = float(wings[0].turned_normal @ wings[1].turned_normal)
+    if abs(aligned) < PARALLEL:
+        return None, None
+    second = tips[:, 1] * np.sign(aligned)
     return 0.5 * (tips[:, 0] + second), 0.5 * (tips[:, 0] - second)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import json
 import sys
+import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -127,6 +128,11 @@ class Case:
     def robot(self) -> Robot:
         """The robot, loaded when first asked for, its appendages turned as the case has them."""
         robot = load_robot(self.robot_source, self.end_effector)
+        known = {visual.get("name", "") for visual in ET.fromstring(robot.urdf).iter("visual")}
+        known |= {appendage.name for appendage in robot.appendages}
+        for name in self.turned:
+            if name not in known:
+                raise InputError(f"[spacecraft] turned_deg: {_unknown('part', name, sorted(known - {''}))}")
         turned = []
         for appendage in robot.appendages:
             R = pin.rpy.rpyToMatrix(0.0, self.turned.get(appendage.name, 0.0), 0.0)

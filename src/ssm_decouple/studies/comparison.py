@@ -134,6 +134,20 @@ def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[An
     return rate, angle
 
 
+def largest_rotation_deg(motion: xr.Dataset, protection: Protection) -> float:
+    """Return the largest true rotation of the base about directions, deg, whatever the motion's law protects.
+
+    Args:
+        motion: Any motion.
+        protection: The directions. Of rows of the whole twist the angular part counts.
+    """
+    turning = protection.U_twist.copy()
+    turning[:3] = 0.0
+    twists, configurations = motion.base_twist_integral.values, motion.configuration.values
+    turned = protected_integral(turning, protection.frame, twists, configurations)
+    return float(np.rad2deg(np.abs(turned).max(initial=0.0)))
+
+
 @dataclass(frozen=True)
 class Comparison:
     """One case under several laws.

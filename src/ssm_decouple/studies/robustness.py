@@ -9,11 +9,12 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import InputError, as_seed
 from ssm_decouple.model.perturb import Tolerances, perturbed
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.dynamic import Dynamic, Load, Sensors, Servo
 from ssm_decouple.studies.case import Case
+from ssm_decouple.studies.comparison import largest_rotation_deg
 
 LEVELS = (0.01, 0.02, 0.05, 0.1)
 RUNS = 200
@@ -94,9 +95,8 @@ def true_rotation(case: Case, physics: Dynamic, protection: Protection | None = 
         simulation={**case.simulation, "method": physics},
     )
     motion = variant.run(protection)
-    turned = motion.base_twist_integral.values @ case.protection.U_twist
     arrived = motion.attrs["outcome"] == "converged"
-    return float(np.rad2deg(np.abs(turned).max(initial=0.0))), float(motion.attrs["final_error"]), arrived
+    return largest_rotation_deg(motion, case.protection), float(motion.attrs["final_error"]), arrived
 
 
 def tolerances_at(level: float) -> Tolerances:
@@ -115,13 +115,14 @@ class Robustness:
     """A Monte Carlo study of one case, in worker processes; what is done stays when it is interrupted.
 
     Attributes:
-        case: The case; its protection has to be fixed in base axes.
+        case: The case; its protection has to be of rotation.
         levels: Levels of error, see `Leak`.
         runs: Random plants at each level; plant i of a level is the same with and without feedback.
         feedback_gain: K, 1/s, of the runs with feedback.
         seed: Of the plants.
         workers: Number of processes.
         found: Results so far: (level, gain) to plant number to rotation, deg, and whether the end-effector arrived.
+        unprotected: The rotation with nothing protected and no error, deg; computed before the first plant.
     """
 
     case: Case
@@ -131,12 +132,14 @@ class Robustness:
     seed: int = 0
     workers: int = 2
     found: dict[tuple[float, float], dict[int, tuple[float, bool]]] = field(default_factory=dict)
+    unprotected: float | None = None
 
     def __post_init__(self) -> None:
         """Refuse what makes no study.
 
         Raises:
-            InputError: a level outside (0, 1), no runs, a gain that is not positive, or nothing protected.
+            InputError: a level outside (0, 1), no runs, no worker, a gain that is not positive, or a case that does not
+                protect rotation alone.
         """
         for level in self.levels:
             if not 0 < level < 1:
@@ -145,8 +148,11 @@ class Robustness:
             raise InputError(f"{self.runs} runs are no study; give at least 1")
         if not self.feedback_gain > 0:
             raise InputError(f"feedback_gain is {self.feedback_gain}; it must be positive, 1/s")
-        if self.case.protection.k == 0 or self.case.protection.frame != "base":
-            raise InputError(f"case '{self.case.name}' needs a protection that is fixed in base axes")
+        if self.workers < 1:
+            raise InputError(f"{self.workers} workers do nothing; give at least 1")
+        as_seed("seed", self.seed)
+        if self.case.protection.k == 0 or np.any(self.case.protection.U_twist[:3]):
+            raise InputError(f"case '{self.case.name}' needs a protection of rotation: one to three directions")
 
     def run(self, progress: Callable[[float], object] | None = None) -> None:
         """Run all that is not yet found.
@@ -157,6 +163,8 @@ class Robustness:
         Raises:
             KeyboardInterrupt: Ctrl-C; `found` keeps what was done.
         """
+        if self.unprotected is None:
+            self.unprotected, *_ = true_rotation(self.case, Dynamic(step=STEP), Protection("none"))
         plain = replace(self.case)  # without a loaded robot, which would travel to the workers
         todo = [
             (level, gain, i)
@@ -176,7 +184,7 @@ class Robustness:
                 if progress is not None:
                     progress(done / len(todo))
         finally:
-            pool.shutdown(cancel_futures=True)
+            pool.shutdown(wait=False, cancel_futures=True)
 
     def _seed(self, i: int) -> int:
         """Return the seed of plant i, the same at every level: there its errors are only larger or smaller."""
@@ -184,8 +192,7 @@ class Robustness:
 
     def leaks(self) -> list[Leak]:
         """Return the figures of what has been found, by level, without feedback first."""
-        unprotected, *_ = true_rotation(self.case, Dynamic(step=STEP), Protection("none"))
-        rows = []
+        unprotected, rows = self.unprotected or np.nan, []
         for (level, gain), runs in sorted(self.found.items()):
             turned = np.array([turned for turned, _ in runs.values()])
             low, median, high = np.percentile(turned, [2.5, 50.0, 97.5])

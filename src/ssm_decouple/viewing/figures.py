@@ -203,6 +203,7 @@ def bending(subject: tuple[Case, Mapping[str, xr.Dataset]]) -> Figure:
     two = parts_of(case, np.zeros((1, len(names))))[0] is not None
     titles = ["symmetric: driven by translation", "antisymmetric: driven by rotation"] if two else names
     figure, axes = panels(2, len(titles), width=PAGE, height=1.95)
+    period = 1.0 / min(appendage.frequency for appendage in case.robot.appendages)
     for law, motion in motions.items():
         tips = 1e3 * motion.tip_deflection.values
         parts = parts_of(case, tips) if two else tuple(tips.T)
@@ -210,7 +211,9 @@ def bending(subject: tuple[Case, Mapping[str, xr.Dataset]]) -> Figure:
             values = np.asarray(part)
             line: dict[str, Any] = {**LAW_LINES.get(law, {}), "label": law, "linewidth": 0.7}
             axes[i].plot(motion.time, values, **line)
-            axes[len(titles) + i].semilogy(motion.time, np.maximum(_envelope(motion.time.values, values), 1e-6), **line)
+            axes[len(titles) + i].semilogy(
+                motion.time, np.maximum(_envelope(motion.time.values, values, period), 1e-6), **line
+            )
     for i, title in enumerate(titles):
         axes[i].set_title(title)
         axes[len(titles) + i].set_xlabel("time (s)")
@@ -222,8 +225,8 @@ def bending(subject: tuple[Case, Mapping[str, xr.Dataset]]) -> Figure:
     return figure
 
 
-def _envelope(time: Floats, values: Floats, window: float = 7.0) -> Floats:
-    """Return the largest magnitude within half a window, s, of each sample: about a period of a slow appendage."""
+def _envelope(time: Floats, values: Floats, window: float) -> Floats:
+    """Return the largest magnitude within half a window, s, of each sample."""
     half = max(1, round(0.5 * window / float(time[1] - time[0])))
     padded = np.pad(np.abs(values), half, mode="edge")
     return np.lib.stride_tricks.sliding_window_view(padded, 2 * half + 1).max(axis=1)
@@ -255,7 +258,7 @@ def robustness(rows: Sequence[Leak]) -> Figure:
         for gain, color in zip(sorted({row.feedback_gain for row in mine}), (PROTECTED, "#0072B2"), strict=False):
             line = sorted((row for row in mine if row.feedback_gain == gain), key=lambda row: row.level)
             levels = [100 * row.level for row in line]
-            label = f"feedback, {gain:g} 1/s" if gain else "no feedback"
+            label = f"feedback, K = {gain:g}/s" if gain else "no feedback"
             axis.loglog(levels, [row.median_deg for row in line], color=color, marker="o", markersize=3, label=label)
             axis.fill_between(
                 levels, [row.low_deg for row in line], [row.high_deg for row in line], color=color, alpha=0.2, lw=0
