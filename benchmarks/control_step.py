@@ -132,6 +132,13 @@ def pink_step(case: ssm.Case, q: Floats) -> Callable[[], Floats]:
     return step
 
 
+def pose_law(case: ssm.Case, q: Floats) -> tuple[ssm.SelectiveLaw, pin.SE3]:
+    """Return the case's law for a pose, and one at the case's target, half a radian turned."""
+    law = ssm.SelectiveLaw(case.robot, case.protection, tasks=ssm.PoseTask())
+    turn = pin.exp3(np.array([0.3, 0.2, 0.4]))
+    return law, pin.SE3(turn @ case.robot.frame_pose(q).rotation, np.array(case.target))
+
+
 def bare_pinocchio(robot: ssm.Robot, q: Floats) -> Callable[[], object]:
     """Return the floor: the Pinocchio calls that any such law needs, from Python, and nothing else."""
     model, data, frame = robot.model, robot.model.createData(), robot.end_effector_id
@@ -161,6 +168,8 @@ def main(name: str) -> None:
             case.robot, law.protection, law.gain, law.rate_limits, sample_time=0.1, hold_nodes=nodes
         )
         candidates[f"law(q, target), hold_nodes={nodes}"] = partial(planned, q, target)
+    posing, pose = pose_law(case, q)
+    candidates["law(q, pose), a PoseTask"] = lambda: posing(q, pose)
     command = law(q, target)
     difference = np.abs(np.asarray(plain()["joint_rates"]) - command.joint_rates).max()
     print(f"{name}, {case.robot.name}, k = {law.protection.k}: plain NumPy differs by {difference:.1e} rad/s")
@@ -187,6 +196,7 @@ def main(name: str) -> None:
     if "Pink, hard constraints, DAQP" in times:
         print(f", {times['Pink, hard constraints, DAQP'] / whole:.1f} times faster than Pink", end="")
     print(f",\nand takes {whole / base:.2f} times the bare Pinocchio calls; its array form {array / base:.2f} times.")
+    print(f"A pose task takes {times['law(q, pose), a PoseTask'] / whole:.2f} times the position task.")
 
     for _ in range(3):
         case.run()

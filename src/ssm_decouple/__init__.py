@@ -19,6 +19,11 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ssm_decouple.control.law import Command as Command
     from ssm_decouple.control.law import SelectiveLaw as SelectiveLaw
+    from ssm_decouple.control.task import BoresightTask as BoresightTask
+    from ssm_decouple.control.task import OrientationTask as OrientationTask
+    from ssm_decouple.control.task import PoseTask as PoseTask
+    from ssm_decouple.control.task import PositionTask as PositionTask
+    from ssm_decouple.control.task import PostureTask as PostureTask
     from ssm_decouple.errors import DecoupleError as DecoupleError
     from ssm_decouple.errors import DecoupleWarning as DecoupleWarning
     from ssm_decouple.errors import FileError as FileError
@@ -35,7 +40,9 @@ if TYPE_CHECKING:
     from ssm_decouple.model.plant import Plant as Plant
     from ssm_decouple.model.report import Report as Report
     from ssm_decouple.model.robot import Robot as Robot
+    from ssm_decouple.model.wheels import Wheel as Wheel
     from ssm_decouple.momentum.coupling import Coupling as Coupling
+    from ssm_decouple.momentum.metrics import Ellipsoid as Ellipsoid
     from ssm_decouple.momentum.protection import Protection as Protection
     from ssm_decouple.simulation.dynamic import Dynamic as Dynamic
     from ssm_decouple.simulation.dynamic import Load as Load
@@ -43,6 +50,8 @@ if TYPE_CHECKING:
     from ssm_decouple.simulation.dynamic import Servo as Servo
     from ssm_decouple.simulation.motion import load_motion as load_motion
     from ssm_decouple.simulation.motion import save_motion as save_motion
+    from ssm_decouple.simulation.reference import TumblingTarget as TumblingTarget
+    from ssm_decouple.simulation.reference import Waypoints as Waypoints
     from ssm_decouple.simulation.simulate import DivergenceError as DivergenceError
     from ssm_decouple.simulation.simulate import SimulationInterrupted as SimulationInterrupted
     from ssm_decouple.simulation.simulate import simulate as simulate
@@ -57,28 +66,37 @@ __version__ = "0.1.0"
 # Each public name and the module that it comes from: imported when first used, so that `import ssm_decouple` is quick.
 _HOME = {
     "Appendage": "model.appendage",
+    "BoresightTask": "control.task",
     "Case": "studies.case",
     "Command": "control.law",
     "Comparison": "studies.comparison",
     "Coupling": "momentum.coupling",
     "DecoupleError": "errors",
     "DecoupleWarning": "errors",
+    "DivergenceError": "simulation.simulate",
     "Dynamic": "simulation.dynamic",
+    "Ellipsoid": "momentum.metrics",
     "FileError": "errors",
     "InputError": "errors",
     "Load": "simulation.dynamic",
     "ModelError": "errors",
     "Modes": "model.appendage",
+    "OrientationTask": "control.task",
     "Plant": "model.plant",
+    "PoseTask": "control.task",
+    "PositionTask": "control.task",
+    "PostureTask": "control.task",
     "Protection": "momentum.protection",
     "Report": "model.report",
     "Robot": "model.robot",
     "SelectiveLaw": "control.law",
     "Sensors": "simulation.dynamic",
     "Servo": "simulation.dynamic",
-    "DivergenceError": "simulation.simulate",
     "SimulationInterrupted": "simulation.simulate",
     "Tolerances": "model.perturb",
+    "TumblingTarget": "simulation.reference",
+    "Waypoints": "simulation.reference",
+    "Wheel": "model.wheels",
     "cases": "studies.case",
     "compare": "studies.comparison",
     "compose": "model.compose",

@@ -182,7 +182,7 @@ def test_a_two_body_closed_form(write):
 
 def test_nothing_in_it_can_be_changed(ets_vii):
     coupling = ets_vii.coupling(ets_vii.configuration())
-    for name in ("H_ww", "H_wq", "J_rc", "J_base", "J_g", "centre_of_mass", "base_rotation"):
+    for name in ("H_ww", "H_wq", "J_rc", "J_base", "J_g", "J_arm", "centre_of_mass", "base_position", "base_rotation"):
         with pytest.raises(ValueError, match="read-only"):
             getattr(coupling, name)[0] = 1.0
     with pytest.raises(AttributeError):

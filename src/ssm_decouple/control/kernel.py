@@ -46,8 +46,8 @@ inlined = compiled_for(inline="always")
 
 _MATRIX, _ROWS, _VECTOR = "float64[::1, :]", "float64[:, ::1]", "float64[::1]"
 # Pinocchio's matrices are stored by columns, everything else by rows.
-_FROM_PINOCCHIO = f"{_MATRIX}, {_MATRIX}, {_MATRIX}, {_VECTOR}"
-_CONSTANTS = f"{_ROWS}, {_ROWS}, {_VECTOR}"
+_FROM_PINOCCHIO = f"{_MATRIX}, {_MATRIX}, {_ROWS}"
+_CONSTANTS = f"{_ROWS}, {_ROWS}, {_ROWS}, {_VECTOR}"
 SELECTIVE_COMMAND = f"int64({_FROM_PINOCCHIO}, {_CONSTANTS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR})"
 
 # What selective_command returns.
@@ -56,45 +56,66 @@ NOT_FINITE = 1
 NO_INERTIA = 2
 NOT_UNIT_QUATERNION = 3
 WRONG_SIZE = 4
+NOT_A_TARGET = 5
 
 # Where the results stand in `out`: first Pinocchio's velocity v, base twist (6: linear, angular, base axes) and joint
 # rates (n), then the following, counted from 6 + n.
 PROTECTED_RATE = 0  # 6, the first k used
 POSITION = 6  # 3: end-effector, inertial axes
-ERROR = 9  # 3: target minus end-effector, inertial axes
-SMALLEST_SINGULAR_VALUE = 12  # of J_gt N_sub
-RATE_SCALE = 13
-DAMPING = 14  # rho
-RANK = 15  # of J_sub
-RATE_BLEND = 16  # 1, or less where acceleration limits held the rates back
-PLAN_CHANGE = 17  # relative change of the rates in the last pass of planning for a hold; 0 without a plan
-RESULTS_SIZE = 18
+RATE_SCALE = 9
+RANK = 10  # of J_sub
+RATE_BLEND = 11  # 1, or less where acceleration limits held the rates back
+PLAN_CHANGE = 12  # relative change of the rates in the last pass of planning for a hold; 0 without a plan
+ERRORS = 13  # one a task row, then the smallest singular value of each level, then rho of each level
 
 # Where the scalars stand in `parameters`.
-GAIN = 0
-THRESHOLD = 1
-DAMPING_LIMIT = 2
-MASS = 3
-LIMITS_STEPS = 4  # 1.0 if RATE_STEP limits anything
-INERTIAL = 5  # 1.0 if U_c is fixed in inertial axes, 0.0 in base axes
+THRESHOLD = 0
+DAMPING_LIMIT = 1
+MASS = 2
+LIMITS_STEPS = 3  # 1.0 if RATE_STEP limits anything
+INERTIAL = 4  # 1.0 if U_c is fixed in inertial axes, 0.0 in base axes
+TOOL_JOINT = 5  # the joint that holds the end-effector
 TOOL = 6  # 3: the end-effector in its joint's frame
-PACE = 9  # in [0, 1]
-WANTED_RATE = 10  # 6, the first k used: b, what J_sub q_dot shall be
-PARAMETERS_SIZE = 16
+TASK_ROWS = 9  # of all tasks together
+LEVELS = 10
+TARGET_SIZE = 11  # length of the targets of all tasks
+VELOCITY_SIZE = 12  # and of their velocities
+PACE = 13  # in [0, 1]
+WANTED_RATE = 14  # 6, the first k used: b, what J_sub q_dot shall be
+PARAMETERS_SIZE = 20
+
+# Where a task's numbers stand in its row of `tasks`; the tasks stand in the order of their levels.
+KIND = 0
+LEVEL = 1  # counted from 0
+ROWS = 2
+JOINT = 3  # the joint that holds the frame
+GAIN = 4
+ROOT_WEIGHT = 5  # square root of the weight
+TARGET = 6  # where its target begins among the targets
+STRIDE = 7  # from row to row of a target that is a matrix
+VELOCITY = 8  # where its velocity begins
+POINT = 9  # 3: the frame's origin in its joint's frame
+AXES = 12  # 9: the frame's axes there, by rows; a boresight's third is the direction
+TASK_SIZE = 21
+
+# Kinds of tasks.
+POINTS = 0  # position of the frame's origin
+TURNS = 1  # rotation of the frame
+LOOKS = 2  # direction of the frame's third axis
+JOINTS = 3  # joint positions
 
 # The rows of `columns`: one entry a joint.
-MOVES_TOOL = 0  # 1.0 where the joint carries the end-effector, else 0.0
-RATE_LIMIT = 1
-RATE_STEP = 2  # largest change of the rate from one command to the next; infinite where it is not limited
+RATE_LIMIT = 0
+RATE_STEP = 1  # largest change of the rate from one command to the next; infinite where it is not limited
+PLACE = 2  # where the joint stands in q
+CONTINUOUS = 3  # 1.0 if it stands there as cosine and sine
+JOINT_POSITION = 4  # filled only where a task needs it
+MOVES = 5  # a row a task: 1.0 where the joint carries its frame, else 0.0; or which of its rows, from 1, the joint is
 
 # The rows of `matrices`, one column a joint.
 J_BASE = 0  # 6: base twist per joint rate, base axes
-J_TASK = 6  # 3: translational generalized Jacobian, inertial axes
-J_PROTECTED = 9  # 6: base twist per joint rate, inertial axes; filled only where U_c is fixed in these
-MATRICES_SIZE = 15
-SOLVE_ROWS = 2 * 6 + 7  # rows of scratch that `solve` needs
-WORK_SIZE = MATRICES_SIZE + 9 + SOLVE_ROWS  # and that a whole command needs
-SMALL = 9  # length of the rows of small scratch: k + 3
+J_PROTECTED = 6  # 6: base twist per joint rate, inertial axes; filled only where U_c is fixed in these
+J_TASK = 12  # a row a task row: its generalized Jacobian, inertial axes, times the root of its weight
 
 EPS = 2.220446049250313e-16
 # A row of J_sub below this many rounding errors of J_rc, a metre from the inertial origin, constrains nothing: noise.
@@ -146,8 +167,8 @@ def base_twist_map(A_g: Floats, J_base: Floats) -> float:
 
 
 @inlined
-def point_velocity_map(J: Floats, p: Floats, J_base: Floats, columns: Floats, base: Floats, J_g: Floats) -> None:
-    """Fill J_g (3, n), the velocity of the point p per joint rate while momentum is conserved, inertial axes.
+def add_point(J: Floats, p: Floats, J_base: Floats, moves: Floats, weight: float, base: Floats, J_task: Floats) -> None:
+    """Add to J_task (3, n) a weight times the velocity of the point p per joint rate, momentum conserved.
 
     J (6, 6 + n) is Pinocchio's Jacobian at the world origin: a joint that carries the point moves it by
     J_linear + J_angular x p, and every joint moves it through the base. `base` (3, 6) is scratch.
@@ -156,15 +177,101 @@ def point_velocity_map(J: Floats, p: Floats, J_base: Floats, columns: Floats, ba
         base[0, c] = J[0, c] + J[4, c] * p[2] - J[5, c] * p[1]
         base[1, c] = J[1, c] + J[5, c] * p[0] - J[3, c] * p[2]
         base[2, c] = J[2, c] + J[3, c] * p[1] - J[4, c] * p[0]
-    for j in range(J_g.shape[1]):
-        c = 6 + j
-        moves = columns[MOVES_TOOL, j]
-        J_g[0, j] = moves * (J[0, c] + J[4, c] * p[2] - J[5, c] * p[1])
-        J_g[1, j] = moves * (J[1, c] + J[5, c] * p[0] - J[3, c] * p[2])
-        J_g[2, j] = moves * (J[2, c] + J[3, c] * p[1] - J[4, c] * p[0])
-        for r in range(3):
-            for b in range(6):
-                J_g[r, j] += base[r, b] * J_base[b, j]
+    for j in range(J_task.shape[1]):
+        c, m = 6 + j, moves[j]
+        x = m * (J[0, c] + J[4, c] * p[2] - J[5, c] * p[1])
+        y = m * (J[1, c] + J[5, c] * p[0] - J[3, c] * p[2])
+        z = m * (J[2, c] + J[3, c] * p[1] - J[4, c] * p[0])
+        for b in range(6):
+            x += base[0, b] * J_base[b, j]
+            y += base[1, b] * J_base[b, j]
+            z += base[2, b] * J_base[b, j]
+        J_task[0, j] += weight * x
+        J_task[1, j] += weight * y
+        J_task[2, j] += weight * z
+
+
+@inlined
+def add_turning(J: Floats, J_base: Floats, moves: Floats, weight: float, B: Floats, rows: int, J_task: Floats) -> None:
+    """Add to J_task (rows, n) a weight times the angular velocity per joint rate, along the first columns of B (3, 3).
+
+    A joint that carries the frame turns it, and every joint turns it through the base.
+    """
+    for j in range(J_task.shape[1]):
+        x, y, z = moves[j] * J[3, 6 + j], moves[j] * J[4, 6 + j], moves[j] * J[5, 6 + j]
+        for b in range(3, 6):
+            x += J[3, b] * J_base[b, j]
+            y += J[4, b] * J_base[b, j]
+            z += J[5, b] * J_base[b, j]
+        for r in range(rows):
+            J_task[r, j] += weight * (B[0, r] * x + B[1, r] * y + B[2, r] * z)
+
+
+@compiled
+def rotation_vector(R: Floats, vector: Floats) -> None:
+    """Fill the rotation vector (3,), rad, of a rotation matrix R (3, 3), at angles from 0 to pi.
+
+    By way of a unit quaternion, whose largest part comes first: no digit is lost near 0 or near pi.
+    """
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    largest, best = trace, 3
+    for i in range(3):
+        if R[i, i] > largest:
+            largest, best = R[i, i], i
+    if best == 3:
+        w = 1.0 + trace
+        vector[0], vector[1], vector[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    else:
+        i, j, k = best, (best + 1) % 3, (best + 2) % 3
+        w = R[k, j] - R[j, k]
+        vector[i] = 1.0 + R[i, i] - R[j, j] - R[k, k]
+        vector[j] = R[j, i] + R[i, j]
+        vector[k] = R[k, i] + R[i, k]
+    sine = np.sqrt(vector[0] ** 2 + vector[1] ** 2 + vector[2] ** 2)
+    scale = 0.0
+    if sine > 0.0:
+        scale = 2.0 * np.arctan2(sine, abs(w)) / (sine if w >= 0.0 else -sine)
+    for r in range(3):
+        vector[r] *= scale
+
+
+@compiled
+def turn_towards(target: Floats, B: Floats, error: Floats) -> bool:
+    """Fill the rotation (2,), rad, about the first columns of B (3, 3) that takes the third one to target (3,).
+
+    It is the shortest such rotation; opposite the target, where there are many, one about the first column. Return
+    False if the target has no direction.
+    """
+    along, first, second = 0.0, 0.0, 0.0
+    for r in range(3):
+        along += B[r, 2] * target[r]
+        first -= B[r, 1] * target[r]
+        second += B[r, 0] * target[r]
+    across = np.sqrt(first * first + second * second)
+    if across > 0.0:
+        scale = np.arctan2(across, along) / across
+        error[0], error[1] = scale * first, scale * second
+    else:
+        error[0], error[1] = (np.pi if along < 0.0 else 0.0), 0.0
+    return across * across + along * along > 0.0
+
+
+@inlined
+def turn_from(target: Floats, start: int, stride: int, B: Floats, E: Floats, error: Floats) -> bool:
+    """Fill the rotation vector (3,) that takes axes B (3, 3) to the target's; return False if it is no rotation."""
+    for r in range(3):
+        for c in range(3):
+            i = start + r * stride
+            E[r, c] = target[i] * B[c, 0] + target[i + 1] * B[c, 1] + target[i + 2] * B[c, 2]
+    rotation_vector(E, error)
+    right = True
+    for r in range(3):
+        a, b = (r + 1) % 3, (r + 2) % 3
+        for c in range(3):  # a rotation's third row is the cross product of the two before
+            d, e = (c + 1) % 3, (c + 2) % 3
+            right = right and abs(E[a, d] * E[b, e] - E[a, e] * E[b, d] - E[r, c]) < 1e-6
+    square = E[0, 0] ** 2 + E[0, 1] ** 2 + E[0, 2] ** 2
+    return right and abs(square - 1.0) < 1e-6
 
 
 @compiled
@@ -198,23 +305,35 @@ def apply_reflection(rows: Floats, weights: Floats, i: int, start: int, x: Float
         x[j] -= product * rows[i, j]
 
 
-@compiled
-def orthogonalise_columns(B: Floats, V: Floats) -> float:
-    """Turn the columns of B (3, 3) until they are orthogonal, V (3, 3) with them; return the shortest length.
+@inlined
+def length_squared(B: Floats, row: int, size: int) -> float:
+    """Return the square of the length of a row's first entries."""
+    square = 0.0
+    for r in range(size):
+        square += B[row, r] ** 2
+    return square
 
-    One-sided Jacobi: B V0 = U S, so the column lengths are the singular values, small ones to full accuracy. What
-    B and V hold on return solves any damped least-squares problem in B by three scalar divisions.
+
+@inlined
+def turn_columns(B: Floats, V: Floats, size: int, count: int) -> float:
+    """Turn `count` columns of length `size` until they are orthogonal, V with them; return the shortest length.
+
+    A column stands in a row of B and of V. One-sided Jacobi: B V0 = U S, so the column lengths are the singular values,
+    small ones to full accuracy. What B and V hold on return solves any damped least-squares problem in B by a scalar
+    division for each column.
     """
-    for a in range(3):
-        for b in range(3):
+    for a in range(count):
+        for b in range(count):
             V[a, b] = 1.0 if a == b else 0.0
     for _ in range(30):
         turned = False
-        for a in range(2):
-            for b in range(a + 1, 3):
-                aa = B[0, a] * B[0, a] + B[1, a] * B[1, a] + B[2, a] * B[2, a]
-                bb = B[0, b] * B[0, b] + B[1, b] * B[1, b] + B[2, b] * B[2, b]
-                ab = B[0, a] * B[0, b] + B[1, a] * B[1, b] + B[2, a] * B[2, b]
+        for a in range(count - 1):
+            for b in range(a + 1, count):
+                aa, bb, ab = 0.0, 0.0, 0.0
+                for r in range(size):
+                    aa += B[a, r] * B[a, r]
+                    bb += B[b, r] * B[b, r]
+                    ab += B[a, r] * B[b, r]
                 if ab * ab <= EPS * EPS * aa * bb:
                     continue
                 turned = True
@@ -224,15 +343,24 @@ def orthogonalise_columns(B: Floats, V: Floats) -> float:
                     t = -t
                 cosine = 1.0 / np.sqrt(1.0 + t * t)
                 sine = cosine * t
-                for r in range(3):
-                    B[r, a], B[r, b] = cosine * B[r, a] - sine * B[r, b], sine * B[r, a] + cosine * B[r, b]
-                    V[r, a], V[r, b] = cosine * V[r, a] - sine * V[r, b], sine * V[r, a] + cosine * V[r, b]
+                for r in range(size):
+                    B[a, r], B[b, r] = cosine * B[a, r] - sine * B[b, r], sine * B[a, r] + cosine * B[b, r]
+                for r in range(count):
+                    V[a, r], V[b, r] = cosine * V[a, r] - sine * V[b, r], sine * V[a, r] + cosine * V[b, r]
         if not turned:
             break
-    shortest = np.inf
-    for a in range(3):
-        shortest = min(shortest, B[0, a] ** 2 + B[1, a] ** 2 + B[2, a] ** 2)
+    shortest = np.inf if count > 0 else 0.0
+    for a in range(count):
+        shortest = min(shortest, length_squared(B, a, size))
     return np.sqrt(shortest)
+
+
+@compiled
+def orthogonalise_columns(B: Floats, V: Floats, size: int, count: int) -> float:
+    """Call `turn_columns`, by loops of a length known to the compiler where that is the usual one."""
+    if size == 3 and count == 3:
+        return turn_columns(B, V, 3, 3)
+    return turn_columns(B, V, size, count)
 
 
 @compiled
@@ -258,42 +386,118 @@ def bring_within_limits(fixed: Floats, q_dot: Floats, columns: Floats, pace: flo
 
 
 @inlined
+def add_joints(
+    target: Floats, start: int, columns: Floats, moves: Floats, weight: float, root: float, J: Floats, error: Floats
+) -> None:
+    """Add a posture task's rows to J (rows, n) and to its error; a continuous joint takes the shorter way."""
+    for j in range(moves.shape[0]):
+        row = int(moves[j]) - 1
+        if row >= 0:
+            left = target[start + row] - columns[JOINT_POSITION, j]
+            if columns[CONTINUOUS, j] > 0.0:
+                left -= 2.0 * np.pi * np.rint(left / (2.0 * np.pi))
+            J[row, j] += weight * root
+            error[row] += weight * left
+
+
+@inlined
+def add_tasks(
+    J: Floats,
+    placements: Floats,
+    J_base: Floats,
+    tasks: Floats,
+    columns: Floats,
+    targets: Floats,
+    velocities: Floats,
+    weight: float,
+    J_task: Floats,
+    errors: Floats,
+    rates: Floats,
+    small: Floats,
+) -> int:
+    """Add the tasks' Jacobian (m, n) and errors (m,), times a weight; return OK or NOT_A_TARGET.
+
+    Of a position only what is to be taken from the target is added: minus where the frame is. To `rates` (m,) the
+    target's velocity is added where it has to be seen from the frame. `small` (11, 6) is overwritten.
+    """
+    base, p, B, E, e = small[0:3], small[3], small[4:7], small[7:10], small[10]
+    row, status = 0, OK
+    for i in range(tasks.shape[0]):
+        task, moves = tasks[i], columns[MOVES + i]
+        kind, rows, start = int(task[KIND]), int(task[ROWS]), int(task[TARGET])
+        J_rows, error, held = J_task[row : row + rows], errors[row : row + rows], placements[int(task[JOINT])]
+        row += rows
+        if kind == POINTS:
+            for r in range(3):
+                p[r] = held[9 + r]
+                for c in range(3):
+                    p[r] += held[3 * c + r] * task[POINT + c]
+                error[r] -= weight * p[r]
+            add_point(J, p, J_base, moves, weight * task[ROOT_WEIGHT], base, J_rows)
+        elif kind == JOINTS:
+            add_joints(targets, start, columns, moves, weight, task[ROOT_WEIGHT], J_rows, error)
+        else:
+            for r in range(3):
+                for c in range(3):
+                    B[r, c] = 0.0
+                    for b in range(3):
+                        B[r, c] += held[3 * b + r] * task[AXES + 3 * b + c]
+            if kind == LOOKS:
+                right, velocity = turn_towards(targets[start : start + 3], B, e), int(task[VELOCITY])
+                for r in range(rows):
+                    for c in range(3):
+                        rates[row - rows + r] += weight * B[c, r] * velocities[velocity + c]
+            else:
+                right = turn_from(targets, start, int(task[STRIDE]), B, E, e)
+                for r in range(3):
+                    for c in range(3):
+                        B[r, c] = 1.0 if r == c else 0.0
+            if not right:
+                status = NOT_A_TARGET
+            for r in range(rows):
+                error[r] += weight * e[r]
+            add_turning(J, J_base, moves, weight * task[ROOT_WEIGHT], B, rows, J_rows)
+    return status
+
+
+@inlined
 def add_matrices_at(
     A_g: Floats,
     J: Floats,
-    joint_rotation: Floats,
-    joint_translation: Floats,
+    placements: Floats,
+    tasks: Floats,
     columns: Floats,
     parameters: Floats,
+    targets: Floats,
+    velocities: Floats,
     weight: float,
     matrices: Floats,
     position: Floats,
-    scratch: Floats,
+    errors: Floats,
+    rates: Floats,
+    J_base: Floats,
     small: Floats,
 ) -> int:
-    """Add one configuration's matrices and end-effector position, times a weight; return OK or what is wrong.
+    """Add one configuration's matrices, end-effector position and errors, times a weight; return OK or what is wrong.
 
-    `scratch` (9, n) and `small` (4, 6) are overwritten.
+    `J_base` (6, n) and `small` (11, 6) are overwritten; the others are those of `add_tasks` and `selective_command`.
     """
     n = columns.shape[1]
     mass = parameters[MASS]
     m_squared = A_g[0, 0] ** 2 + A_g[1, 0] ** 2 + A_g[2, 0] ** 2
     if abs(m_squared - mass * mass) > 1e-6 * mass * mass:
         return NOT_UNIT_QUATERNION
-    J_base, J_g, p = scratch[0:6], scratch[6:9], small[3]
     if base_twist_map(A_g, J_base) == 0.0:
         return NO_INERTIA
+    held = placements[int(parameters[TOOL_JOINT])]
     for r in range(3):
-        p[r] = joint_translation[r]
+        at = held[9 + r]
         for c in range(3):
-            p[r] += joint_rotation[r, c] * parameters[TOOL + c]
-        position[r] += weight * p[r]
-    point_velocity_map(J, p, J_base, columns, small[0:3], J_g)
+            at += held[3 * c + r] * parameters[TOOL + c]
+        position[r] += weight * at
     for j in range(n):
         for b in range(6):
             matrices[J_BASE + b, j] += weight * J_base[b, j]
-        for r in range(3):
-            matrices[J_TASK + r, j] += weight * J_g[r, j]
     if parameters[INERTIAL] > 0.0:
         for j in range(n):
             for b in range(0, 6, 3):
@@ -301,7 +505,8 @@ def add_matrices_at(
                 for r in range(3):
                     turned = (A_g[r, 0] * x + A_g[r, 1] * y + A_g[r, 2] * z) / mass
                     matrices[J_PROTECTED + b + r, j] += weight * turned
-    return OK
+    J_task = matrices[J_TASK:]
+    return add_tasks(J, placements, J_base, tasks, columns, targets, velocities, weight, J_task, errors, rates, small)
 
 
 @inlined
@@ -334,45 +539,64 @@ def factor_protected_rows(rows: Floats, weights: Floats, diagonal: Floats, order
 
 
 @inlined
-def factor_task_rows(rows: Floats, weights: Floats, k: int, rank: int, L: Floats) -> int:
-    """Make the task rows, after the first k, lower triangular L (3, 3) past `rank`; return how many columns L has."""
-    free = min(3, rows.shape[1] - rank)
-    L[:, :] = 0.0
-    for t in range(free):
+def factor_level(
+    rows: Floats, weights: Floats, starts: Floats, first: int, size: int, at: int, noise: float, L: Floats
+) -> int:
+    """Make a level's rows lower triangular past the coordinate `at`, L; return how many columns L has.
+
+    L is stored by columns. A row whose rest is not above `noise` depends on those before and takes no coordinate.
+    """
+    n, count = rows.shape[1], 0
+    for t in range(size):
+        for s in range(count):
+            L[s, t] = rows[first + t, at + s]
+        starts[first + t] = -1.0
+        if at + count == n:
+            continue
         for s in range(t):
-            L[t, s] = rows[k + t, rank + s]
-        L[t, t] = reflect(rows, weights, k + t, rank + t)
-        for i in range(t + 1, 3):
-            apply_reflection(rows, weights, k + t, rank + t, rows[k + i])
-    for t in range(free, 3):
-        for s in range(free):
-            L[t, s] = rows[k + t, rank + s]
-    return free
+            L[count, s] = 0.0
+        L[count, t] = reflect(rows, weights, first + t, at + count)
+        if abs(L[count, t]) <= noise:
+            continue
+        starts[first + t] = at + count
+        for i in range(first + t + 1, rows.shape[0]):
+            apply_reflection(rows, weights, first + t, at + count, rows[i])
+        count += 1
+    return count
 
 
 @inlined
-def damped_solution(L: Floats, V: Floats, v: Floats, free: int, parameters: Floats, results: Floats, y: Floats) -> None:
+def damped_solution(
+    L: Floats, V: Floats, v: Floats, count: int, full: bool, parameters: Floats, told: Floats, y: Floats
+) -> None:
     """Add the minimiser of |L y - v|^2 + rho |y|^2 to y; L and V are overwritten.
 
-    rho is zero while the smallest singular value is above the threshold and rises smoothly below it.
+    rho is zero while the smallest singular value is above the threshold and rises smoothly below it. `full` says that
+    L needs a column for each row to have a smallest singular value above zero. `told` (2, ) takes this and rho.
     """
-    smallest = orthogonalise_columns(L, V)
+    size = v.shape[0]
+    smallest = orthogonalise_columns(L, V, size, count)
+    if full and count < size:
+        smallest = 0.0
     rho = 0.0
     if smallest < parameters[THRESHOLD]:
         ratio = smallest / parameters[THRESHOLD]
         rho = parameters[DAMPING_LIMIT] * (1.0 - ratio * ratio) ** 2
     largest_square = 0.0
-    for c in range(3):
-        largest_square = max(largest_square, L[0, c] ** 2 + L[1, c] ** 2 + L[2, c] ** 2)
-    for c in range(3):
-        square = L[0, c] ** 2 + L[1, c] ** 2 + L[2, c] ** 2
+    for c in range(count):
+        largest_square = max(largest_square, length_squared(L, c, size))
+    for c in range(count):
+        square = length_squared(L, c, size)
         if rho == 0.0 and square <= EPS * EPS * 16.0 * largest_square:
             continue  # the Moore-Penrose inverse of a singular value that is zero
-        part = (L[0, c] * v[0] + L[1, c] * v[1] + L[2, c] * v[2]) / (square + rho)
-        for s in range(free):
-            y[s] += V[s, c] * part
-    results[SMALLEST_SINGULAR_VALUE] = smallest
-    results[DAMPING] = rho
+        part = 0.0
+        for r in range(size):
+            part += L[c, r] * v[r]
+        part /= square + rho
+        for s in range(count):
+            y[s] += V[c, s] * part
+    told[0] = smallest
+    told[1] = rho
 
 
 @compiled
@@ -483,36 +707,70 @@ def largest_blend(start: Floats, end: Floats, previous: Floats, columns: Floats)
 
 
 @inlined
+def meet_tasks(
+    matrices: Floats,
+    tasks: Floats,
+    parameters: Floats,
+    targets: Floats,
+    velocities: Floats,
+    rates: Floats,
+    results: Floats,
+    fixed: Floats,
+    asked: bool,
+    v: Floats,
+) -> None:
+    """Fill what the task rows shall do, v (m,), times the root of the weight, and complete the errors of positions."""
+    pace, row = parameters[PACE], 0
+    for i in range(tasks.shape[0]):
+        task = tasks[i]
+        kind, start, velocity = int(task[KIND]), int(task[TARGET]), int(task[VELOCITY])
+        for r in range(int(task[ROWS])):
+            wanted = rates[row] if kind == LOOKS else velocities[velocity + r]
+            if kind == POINTS:
+                results[ERRORS + row] = targets[start + r * int(task[STRIDE])] + results[ERRORS + row]
+            v[row] = task[ROOT_WEIGHT] * (pace * (wanted + task[GAIN] * results[ERRORS + row]))
+            row += 1
+    if asked:
+        for r in range(v.shape[0]):
+            for j in range(fixed.shape[0]):
+                v[r] -= matrices[J_TASK + r, j] * fixed[j]
+
+
+@inlined
 def solve(
     matrices: Floats,
     U_c: Floats,
+    tasks: Floats,
     columns: Floats,
     parameters: Floats,
-    target: Floats,
-    target_velocity: Floats,
+    targets: Floats,
+    velocities: Floats,
     previous: Floats,
     out: Floats,
+    rates: Floats,
     scratch: Floats,
     small: Floats,
 ) -> int:
     """Write the command that the matrices give into `out`; return OK or NOT_FINITE.
 
-    The end-effector's position stands in `out` already. `scratch` (SOLVE_ROWS, n) and `small` (11, SMALL) are
-    overwritten.
+    The end-effector's position and the tasks' errors, positions' without their targets, stand in `out` already.
+    `scratch` (16 + m, n) and `small` (2 m + 7, 6 + m) are overwritten, with m task rows.
 
-    One Householder factorisation of [J_sub; J_g]^T carries the whole law. With Q its reflections in order, J_sub is
-    lower triangular in the first r = rank(J_sub) coordinates of Q^T q_dot, so a rate that is zero in those lies in
-    null(J_sub) whatever the others are. In the next three coordinates J_g is the lower triangular L (3, 3), whose
-    singular values are those of J_gt N_sub, and min |L y - v_cmd|^2 + rho |y|^2 is the paper's objective.
+    One Householder factorisation of [J_sub; J_1; J_2; ..]^T carries the whole law, J_l being the rows of the tasks of
+    level l. With Q its reflections in order, J_sub is lower triangular in the first r = rank(J_sub) coordinates of
+    Q^T q_dot, so a rate that is zero in those lies in null(J_sub) whatever the others are. In the next coordinates J_1
+    is the lower triangular L, whose singular values are those of J_1 N_sub, and min |L y - v_cmd|^2 + rho |y|^2 is the
+    paper's objective. What is left moves neither, and there J_2 is lower triangular, and so on.
 
-    Where J_sub q_dot = b is asked for, all that stands beside a fixed part J_sub^+ b, which the task takes as given.
+    Where J_sub q_dot = b is asked for, all that stands beside a fixed part J_sub^+ b, which the tasks take as given.
     """
-    n, k, pace = columns.shape[1], U_c.shape[1], parameters[PACE]
+    n, k, m, pace = columns.shape[1], U_c.shape[1], matrices.shape[0] - J_TASK, parameters[PACE]
     results = out[6 + n :]
-    J_sub, rows, q_dot = scratch[0:k], scratch[k : 2 * k + 3], scratch[2 * k + 3]
-    leak, slow, fixed = scratch[2 * k + 4], scratch[2 * k + 5], scratch[2 * k + 6]
-    L, V, weights = small[0:3], small[3:6], small[6]
-    diagonal, v, order, wanted = small[7], small[8], small[9], small[10]
+    J_sub, rows, q_dot = scratch[0:k], scratch[k : 2 * k + m], scratch[2 * k + m]
+    leak, slow, fixed = scratch[2 * k + m + 1], scratch[2 * k + m + 2], scratch[2 * k + m + 3]
+    L, V, weights, starts = small[0:m], small[m : 2 * m], small[2 * m], small[2 * m + 1]
+    diagonal, v, order = small[2 * m + 2], small[2 * m + 3, :m], small[2 * m + 4]
+    wanted, part = small[2 * m + 5], small[2 * m + 6]
     first, asked = 3, False
     for i in range(k):
         order[i] = i
@@ -532,24 +790,39 @@ def solve(
             for b in range(first, 6):
                 J_sub[i, j] += U_c[b, i] * matrices[source + b, j]
             rows[i, j] = J_sub[i, j]
-        for r in range(3):
+        for r in range(m):
             rows[k + r, j] = matrices[J_TASK + r, j]
     # The matrices are sums about the inertial origin, so that their rounding grows with the distance from it.
     far = 1.0 + abs(results[POSITION]) + abs(results[POSITION + 1]) + abs(results[POSITION + 2])
     rank = factor_protected_rows(rows, weights, diagonal, order, k, NOISE * far * np.sqrt(scale))
-    free = factor_task_rows(rows, weights, k, rank, L)
-
-    for r in range(3):
-        results[ERROR + r] = target[r] - results[POSITION + r]
-        v[r] = pace * (target_velocity[r] + parameters[GAIN] * results[ERROR + r])
     if asked:
         fixed_part(J_sub, rows, weights, diagonal, order, rank, columns, wanted, leak, fixed)
-        for r in range(3):
-            for j in range(n):
-                v[r] -= matrices[J_TASK + r, j] * fixed[j]
-    damped_solution(L, V, v, free, parameters, results, q_dot[rank:])
-    for t in range(free - 1, -1, -1):
-        apply_reflection(rows, weights, k + t, rank + t, q_dot)
+    meet_tasks(matrices, tasks, parameters, targets, velocities, rates, results, fixed, asked, v)
+
+    levels, at, row, i = int(parameters[LEVELS]), rank, 0, 0
+    for level in range(levels):
+        size, scale = 0, 0.0
+        while i < tasks.shape[0] and int(tasks[i, LEVEL]) == level:
+            size += int(tasks[i, ROWS])
+            i += 1
+        noise = -1.0  # nothing is below it: of the last level every row may take a coordinate
+        if level < levels - 1:
+            for r in range(row, row + size):
+                for j in range(n):
+                    scale += matrices[J_TASK + r, j] ** 2
+            noise = NOISE * far * np.sqrt(scale)
+        count = factor_level(rows, weights, starts, k + row, size, at, noise, L)
+        for t in range(size):
+            part[t] = v[row + t]
+            for s in range(rank, at):
+                part[t] -= rows[k + row + t, s] * q_dot[s]
+        told = results[ERRORS + m + 2 * level :]
+        damped_solution(L, V, part[:size], count, level == 0, parameters, told, q_dot[at:])
+        at += count
+        row += size
+    for t in range(m - 1, -1, -1):
+        if starts[k + t] >= 0.0:
+            apply_reflection(rows, weights, k + t, int(starts[k + t]), q_dot)
     for i in range(rank - 1, -1, -1):
         apply_reflection(rows, weights, i, i, q_dot)
     if asked:
@@ -573,7 +846,9 @@ def solve(
         # Where J_sub is ill-conditioned the correction can lift a rate above its limit by more than rounding.
         rate_scale *= bring_within_limits(fixed, q_dot, columns, pace)
 
-    total = v[0] + v[1] + v[2]
+    total = 0.0
+    for r in range(m):
+        total += v[r]
     for j in range(n):
         out[6 + j] = q_dot[j]
         total += q_dot[j]
@@ -594,104 +869,158 @@ def solve(
 
 
 @inlined
-def wrong_size(n: int, target: Floats, target_velocity: Floats, previous: Floats, out: Floats) -> bool:
+def wrong_size(n: int, parameters: Floats, targets: Floats, velocities: Floats, previous: Floats, out: Floats) -> bool:
     """Say whether an array has the wrong length: compiled code would read past its end."""
-    vectors = target.shape[0] != 3 or target_velocity.shape[0] != 3
-    return vectors or previous.shape[0] != n or out.shape[0] != 6 + n + RESULTS_SIZE
+    size = 6 + n + ERRORS + int(parameters[TASK_ROWS]) + 2 * int(parameters[LEVELS])
+    vectors = targets.shape[0] != int(parameters[TARGET_SIZE]) or velocities.shape[0] != int(parameters[VELOCITY_SIZE])
+    return vectors or previous.shape[0] != n or out.shape[0] != size
 
 
 @compiled_for(SELECTIVE_COMMAND)
 def selective_command(
     A_g: Floats,
     J: Floats,
-    joint_rotation: Floats,
-    joint_translation: Floats,
+    placements: Floats,
     U_c: Floats,
+    tasks: Floats,
     columns: Floats,
     parameters: Floats,
-    target: Floats,
-    target_velocity: Floats,
+    targets: Floats,
+    velocities: Floats,
     previous: Floats,
     out: Floats,
 ) -> int:
-    """Write q_dot = (J_gt N_sub)^+ v_cmd and what follows from it into `out`; return OK or what is wrong.
+    """Write q_dot = (J_gt N_sub)^+ v_cmd, or what the tasks make of it, and what follows into `out`.
 
     Args:
         A_g: Centroidal map (6, 6 + n), `pin.Data.Ag` after `pin.computeCentroidalMap`.
         J: Joint Jacobians at the world origin (6, 6 + n), `pin.Data.J` after the same call.
-        joint_rotation: Rotation (3, 3) of the joint that holds the end-effector, joint to inertial.
-        joint_translation: Its position (3,), m, inertial axes.
+        placements: Of all joints (joints, 12), `pin.Data.oMi`: rotation, joint to inertial, by columns, and
+            position, m, inertial axes.
         U_c: Protected directions of the base twist (6, k), orthonormal columns, base or inertial axes as `parameters`
             says.
-        columns: (3, n), MOVES_TOOL, RATE_LIMIT and RATE_STEP for each joint.
+        tasks: (tasks, TASK_SIZE), by the indices above.
+        columns: (MOVES + tasks, n), for each joint.
         parameters: (PARAMETERS_SIZE,), by the indices above.
-        target: Desired end-effector position (3,), m, inertial axes.
-        target_velocity: Its velocity (3,), m/s.
+        targets: Of all tasks; a position (3,), m, inertial axes, and the like.
+        velocities: Theirs, m/s or rad/s, a number a task row, of a direction three.
         previous: The rates commanded before (n,); read only where RATE_STEP limits something.
-        out: (6 + n + RESULTS_SIZE,), overwritten.
+        out: (6 + n + ERRORS + task rows + 2 levels,), overwritten.
 
     Returns:
-        OK, NOT_FINITE (in the configuration or the target), NO_INERTIA (H_ww is singular), NOT_UNIT_QUATERNION or
-        WRONG_SIZE (of a target, of `previous` or of `out`).
+        OK, NOT_FINITE (in the configuration or the targets), NO_INERTIA (H_ww is singular), NOT_UNIT_QUATERNION,
+        WRONG_SIZE (of targets, of `previous` or of `out`) or NOT_A_TARGET (no rotation or no direction).
     """
-    n = columns.shape[1]
-    if wrong_size(n, target, target_velocity, previous, out):
+    n, m = columns.shape[1], int(parameters[TASK_ROWS])
+    if wrong_size(n, parameters, targets, velocities, previous, out):
         return WRONG_SIZE
     # Two allocations for all scratch: each costs as much as a reflection.
-    work, small = np.empty((WORK_SIZE, n)), np.empty((11, SMALL))
-    matrices, scratch = work[:MATRICES_SIZE], work[MATRICES_SIZE:]
-    position = out[6 + n + POSITION : 9 + n + POSITION]
+    work, small = np.empty((J_TASK + 22 + 2 * m, n)), np.empty((max(2 * m + 7, 11) + 1, 6 + m))
+    matrices, J_base, scratch = work[: J_TASK + m], work[J_TASK + m : J_TASK + m + 6], work[J_TASK + m + 6 :]
+    results = out[6 + n :]
+    position, errors = results[POSITION : POSITION + 3], results[ERRORS : ERRORS + m]
+    rates = small[small.shape[0] - 1, :m]
     matrices[:] = 0.0
     position[:] = 0.0
+    errors[:] = 0.0
+    rates[:] = 0.0
     status = add_matrices_at(
         A_g,
         J,
-        joint_rotation,
-        joint_translation,
+        placements,
+        tasks,
         columns,
         parameters,
+        targets,
+        velocities,
         1.0,
         matrices,
         position,
-        scratch,
+        errors,
+        rates,
+        J_base,
         small,
     )
     if status != OK:
         return status
-    return solve(matrices, U_c, columns, parameters, target, target_velocity, previous, out, scratch[9:], small)
+    return solve(matrices, U_c, tasks, columns, parameters, targets, velocities, previous, out, rates, scratch, small)
 
 
 @compiled
 def add_matrices(
     A_g: Floats,
     J: Floats,
-    joint_rotation: Floats,
-    joint_translation: Floats,
+    placements: Floats,
     U_c: Floats,
+    tasks: Floats,
     columns: Floats,
     parameters: Floats,
+    targets: Floats,
+    velocities: Floats,
     weight: float,
     matrices: Floats,
-    position: Floats,
+    rates: Floats,
+    out: Floats,
 ) -> int:
-    """Add one configuration's matrices (MATRICES_SIZE, n) and end-effector position (3,), times a weight.
+    """Add one configuration's matrices (J_TASK + m, n) and rates (m,), and what stands in `out`, times a weight.
 
-    The other arguments and the value returned are those of `selective_command`.
+    With m task rows; in `out` position and errors. The other arguments and the value returned are those of
+    `selective_command`, the sizes of targets and velocities as `parameters` says.
     """
-    scratch, small = np.empty((9, columns.shape[1])), np.empty((4, 6))
+    n, m = columns.shape[1], int(parameters[TASK_ROWS])
+    J_base, small, results = np.empty((6, n)), np.empty((11, 6)), out[6 + n :]
     return add_matrices_at(
         A_g,
         J,
-        joint_rotation,
-        joint_translation,
+        placements,
+        tasks,
         columns,
         parameters,
+        targets,
+        velocities,
         weight,
         matrices,
-        position,
-        scratch,
+        results[POSITION : POSITION + 3],
+        results[ERRORS : ERRORS + m],
+        rates,
+        J_base,
         small,
     )
+
+
+@compiled
+def advance_targets(tasks: Floats, targets: Floats, velocities: Floats, time: float, later: Floats) -> None:
+    """Fill where targets will be after a time, s, at their velocities; turns are exact."""
+    for i in range(targets.shape[0]):
+        later[i] = targets[i]
+    for i in range(tasks.shape[0]):
+        kind, rows = int(tasks[i, KIND]), int(tasks[i, ROWS])
+        start, stride, velocity = int(tasks[i, TARGET]), int(tasks[i, STRIDE]), int(tasks[i, VELOCITY])
+        if kind in (POINTS, JOINTS):
+            for r in range(rows):
+                later[start + r * stride] = targets[start + r * stride] + time * velocities[velocity + r]
+            continue
+        w = velocities[velocity : velocity + 3] * time
+        angle = np.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
+        if angle == 0.0:
+            continue
+        w /= angle
+        for c in range(3 if kind == TURNS else 1):  # Rodrigues' formula on each column
+            x, y, z = targets[start + c], targets[start + stride + c], targets[start + 2 * stride + c]
+            along = (w[0] * x + w[1] * y + w[2] * z) * (1.0 - np.cos(angle))
+            later[start + c] = np.cos(angle) * x + np.sin(angle) * (w[1] * z - w[2] * y) + along * w[0]
+            later[start + stride + c] = np.cos(angle) * y + np.sin(angle) * (w[2] * x - w[0] * z) + along * w[1]
+            later[start + 2 * stride + c] = np.cos(angle) * z + np.sin(angle) * (w[0] * y - w[1] * x) + along * w[2]
+
+
+@compiled_for("void(float64[::1], float64[:, ::1])")
+def read_joints(q: Floats, columns: Floats) -> None:
+    """Write the joint positions of a configuration into `columns`; those of continuous joints within (-pi, pi]."""
+    for j in range(columns.shape[1]):
+        place = int(columns[PLACE, j])
+        columns[JOINT_POSITION, j] = q[place]
+        if columns[CONTINUOUS, j] > 0.0:
+            columns[JOINT_POSITION, j] = np.arctan2(q[place + 1], q[place])
 
 
 @compiled_for("boolean(float64[::1], int64[::1])")
@@ -720,19 +1049,21 @@ def change_of(rates: Floats, before: Floats) -> float:
 def held_command(
     matrices: Floats,
     U_c: Floats,
+    tasks: Floats,
     columns: Floats,
     parameters: Floats,
-    target: Floats,
-    target_velocity: Floats,
+    targets: Floats,
+    velocities: Floats,
     previous: Floats,
+    rates: Floats,
     out: Floats,
 ) -> int:
-    """Write the command of averaged matrices into `out`, the arguments being those of `selective_command`.
+    """Write the command of averaged matrices and rates into `out`, the arguments being those of `selective_command`.
 
-    The averaged end-effector position stands in `out` already.
+    The averaged end-effector position and errors stand in `out` already.
     """
-    n = columns.shape[1]
-    if wrong_size(n, target, target_velocity, previous, out):
+    n, m = columns.shape[1], int(parameters[TASK_ROWS])
+    if wrong_size(n, parameters, targets, velocities, previous, out):
         return WRONG_SIZE
-    scratch, small = np.empty((SOLVE_ROWS, n)), np.empty((11, SMALL))
-    return solve(matrices, U_c, columns, parameters, target, target_velocity, previous, out, scratch, small)
+    scratch, small = np.empty((16 + m, n)), np.empty((max(2 * m + 7, 11) + 1, 6 + m))
+    return solve(matrices, U_c, tasks, columns, parameters, targets, velocities, previous, out, rates, scratch, small)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -9,13 +12,12 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.errors import InputError, as_floats
+from ssm_decouple.control.task import Layout, PositionTask, Task, checked_tasks
+from ssm_decouple.errors import DecoupleWarning, InputError, as_floats
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 
 Floats = NDArray[np.float64]
-
-AT_REST: Floats = np.zeros(3)  # writable, as the kernel wants its vectors; never written
 
 # Nodes and weights on [0, 1]; with m nodes the mean is exact to order 2 m.
 GAUSS: dict[int, tuple[tuple[float, float], ...]] = {
@@ -34,15 +36,17 @@ CONVERGED = 1e-13  # relative change of the rates from pass to pass
 class Command:
     """What the law commands at one configuration, and what follows from it.
 
-    The numbers stand in one array, `values`, and the attributes are views of it.
+    The numbers stand in one array, `values`, and the attributes are views of it. What belongs to a task comes in the
+    order in which the tasks were given to the law, what belongs to a level in the order of the levels.
     """
 
-    __slots__ = ("k", "n", "values")
+    __slots__ = ("k", "layout", "n", "values")
 
-    def __init__(self, values: Floats, n: int, k: int) -> None:
+    def __init__(self, values: Floats, n: int, k: int, layout: Layout) -> None:
         self.values = values
         self.n = n
         self.k = k
+        self.layout = layout
 
     @property
     def velocity(self) -> Floats:
@@ -80,13 +84,32 @@ class Command:
 
     @property
     def end_effector_error(self) -> Floats:
-        """Target minus end-effector position (3,), m, inertial axes."""
-        return self._results(kernel.ERROR, 3)
+        """Target minus end-effector position (3,), m, inertial axes; not numbers where no task asks for a position."""
+        rows = self.layout.tool_position
+        return np.full(3, np.nan) if rows is None else self.values[6 + self.n + kernel.ERRORS :][rows]
+
+    @property
+    def errors(self) -> tuple[Floats, ...]:
+        """Each task's error, m and rad, as the task's class defines it."""
+        errors = self.values[6 + self.n + kernel.ERRORS :]
+        return tuple(errors[rows] for rows in self.layout.rows)
 
     @property
     def smallest_singular_value(self) -> float:
-        """Smallest singular value of J_gt N_sub: m/s of end-effector per rad/s in the hardest direction."""
-        return float(self._results(kernel.SMALLEST_SINGULAR_VALUE)[0])
+        """Smallest singular value of J_gt N_sub: m/s of end-effector per rad/s in the hardest direction.
+
+        Of other tasks, that of J_1 N_sub, J_1 being the rows of the first level, each times the root of its weight.
+        """
+        return float(self.smallest_singular_values[0])
+
+    @property
+    def smallest_singular_values(self) -> Floats:
+        """Of each level, that of its rows in what the protection and the levels before it leave (levels,).
+
+        The first is 0 where fewer freedoms are left than it has rows. Of the others, to which it is natural to get less
+        than they ask for, it is the smallest of as many as there are freedoms.
+        """
+        return self._results(kernel.ERRORS + self.layout.size, 2 * len(self.layout.level_rows))[::2]
 
     @property
     def rate_scale(self) -> float:
@@ -98,8 +121,13 @@ class Command:
 
     @property
     def damping(self) -> float:
-        """The regularising scalar rho that was used (paper, eq. 11), m2; 0 away from singularities."""
-        return float(self._results(kernel.DAMPING)[0])
+        """The regularising scalar rho of the first level (paper, eq. 11), m2; 0 away from singularities."""
+        return float(self.dampings[0])
+
+    @property
+    def dampings(self) -> Floats:
+        """The regularising scalar rho of each level (levels,)."""
+        return self._results(kernel.ERRORS + self.layout.size, 2 * len(self.layout.level_rows))[1::2]
 
     @property
     def rate_blend(self) -> float:
@@ -113,8 +141,8 @@ class Command:
 
     @property
     def regularised(self) -> bool:
-        """Whether rho entered, so that the end-effector does not get exactly the velocity asked for."""
-        return self.damping > 0.0
+        """Whether rho entered on some level, so that its tasks do not get exactly the velocity asked for."""
+        return bool(np.any(self.dampings > 0.0))
 
     @property
     def rank(self) -> int:
@@ -125,13 +153,34 @@ class Command:
         start = 6 + self.n + index
         return self.values[start : start + count]
 
+    def _told_errors(self) -> str:
+        if self.layout.plain:
+            return f"{np.linalg.norm(self.errors[0]):.6g} m"
+        return ", ".join(f"{np.linalg.norm(e):.6g}" for e in self.errors)
+
     def __repr__(self) -> str:
         rates = ", ".join(f"{x:.6g}" for x in self.joint_rates)
         return (
             f"Command(joint_rates=[{rates}] rad/s, |protected_rate|={np.linalg.norm(self.protected_rate):.2g} rad/s, "
-            f"error={np.linalg.norm(self.end_effector_error):.6g} m, rate_scale={self.rate_scale:.4g}, "
+            f"error={self._told_errors()}, rate_scale={self.rate_scale:.4g}, "
             f"smallest_singular_value={self.smallest_singular_value:.4g}, damping={self.damping:.3g})"
         )
+
+
+@dataclass(frozen=True)
+class LostDirection:
+    """What the tasks of level 1 can do least, and why.
+
+    Attributes:
+        direction: Unit vector (rows of level 1,), in the order and the units of their errors.
+        singular_value: How much of it a unit of joint rates gives at most; 0 at a singularity.
+        without: The same for this direction if one protected direction were given up (k,). The largest belongs to
+            the protected row that takes it; where none is above `singular_value`, the arm itself is singular.
+    """
+
+    direction: Floats
+    singular_value: float
+    without: Floats
 
 
 class SelectiveLaw:
@@ -151,12 +200,17 @@ class SelectiveLaw:
     coming hold instead: at the middle (1), or at 2 or 3 Gauss points, along the motion that the command itself causes.
     Then the *rotation* about a direction fixed in base axes is zero over the hold, to the quadrature's order.
 
+    Other tasks than the end-effector's position take its place in the same formula: J_1, the rows of all tasks of level
+    1, each times the root of its task's weight, stands for J_gt. A second level acts in what the protection and J_1
+    leave, and so on; no level disturbs those before it. rho is found for each level.
+
     A law holds Pinocchio's scratch memory: use one law in one thread.
 
     Args:
         robot: The robot.
         protection: The directions about which the base must not turn.
-        gain: Tracking gain k_p, 1/s.
+        tasks: What the arm shall do: one task or several; None is the end-effector's position, `PositionTask()`.
+        gain: Tracking gain k_p, 1/s, of the tasks that name none.
         rate_limit: Largest joint rates, rad/s or m/s: one number, an array (n,), or None for the URDF's.
         damping: rho at a singularity, m2; 0 gives the Moore-Penrose inverse everywhere.
         damping_threshold: Smallest singular value, m, below which rho enters.
@@ -169,10 +223,12 @@ class SelectiveLaw:
 
     Attributes:
         size: Length of the array that `evaluate` fills.
+        tasks: The tasks, a tuple.
+        layout: Where their rows and targets stand.
 
     Raises:
-        InputError: a number that is not positive (damping may be 0), a wrong shape, a missing sample time, or a robot
-            without joints.
+        InputError: a number that is not positive (damping may be 0), a wrong shape, a missing sample time, a robot
+            without joints, a task that the robot cannot do, or a protection that takes all freedoms of the tasks.
     """
 
     def __init__(
@@ -186,6 +242,7 @@ class SelectiveLaw:
         sample_time: float | None = None,
         hold_nodes: int = 0,
         acceleration_limit: ArrayLike | None = None,
+        tasks: Task | Sequence[Task] | None = None,
     ) -> None:
         n = robot.n_joints
         if n == 0:
@@ -209,41 +266,84 @@ class SelectiveLaw:
         self.acceleration_limits: Floats | None = None
         if acceleration_limit is not None:
             self.acceleration_limits = _limits(robot, "acceleration_limit", acceleration_limit)
-        self.size: int = 6 + n + kernel.RESULTS_SIZE
+        self.tasks = (PositionTask(),) if tasks is None else checked_tasks(robot, tasks)
+        self.layout = Layout(robot, self.tasks, self.gain)
+        self.size: int = 6 + n + kernel.ERRORS + self.layout.size + 2 * len(self.layout.level_rows)
         self._prepare()
+        if tasks is not None:
+            self._refuse_what_nothing_is_left_for()
+
+    def _refuse_what_nothing_is_left_for(self) -> None:
+        """Count freedoms where the arm stands nowhere special."""
+        n = self.robot.n_joints
+        q = self.robot.configuration(np.linspace(0.3, 1.1, n))
+        Z, J = self.protection.null_space_basis(self.robot.coupling(q)), self._task_jacobian(q)
+        left = Z.shape[1]
+        if left == 0:
+            raise InputError(
+                f"the protection takes {n} of the {n} freedoms of '{self.robot.name}' and leaves 0 to the tasks, which "
+                f"have {self.layout.size} rows; protect fewer directions"
+            )
+        for number, rows in enumerate(self.layout.level_rows, 1):
+            if Z.shape[1] == 0:
+                warnings.warn(
+                    f"nothing is left for the tasks from level {number} on: of the {n} freedoms of '{self.robot.name}' "
+                    f"the protection takes {n - left} and the levels before {left}",
+                    DecoupleWarning,
+                    stacklevel=3,
+                )
+                break
+            _, singular, right = np.linalg.svd(J[rows] @ Z)
+            Z = Z @ right[int(np.sum(singular > 1e-9 * np.linalg.norm(J[rows]))) :].T
+
+    def _task_jacobian(self, q: Floats) -> Floats:
+        """Return the generalized Jacobian of the task rows (m, n) at q, each times the root of its task's weight."""
+        model, data, _, _, fixed = self._prepared
+        targets, velocities = np.zeros(self.layout.target_sizes[0]), self._at_rest
+        pin.computeCentroidalMap(model, data, q)
+        matrices, rates, out = np.zeros_like(self._matrices), np.zeros(self.layout.size), np.zeros(self.size)
+        kernel.add_matrices(*fixed, targets, velocities, 1.0, matrices, rates, out)
+        return matrices[kernel.J_TASK :]
 
     def _prepare(self) -> None:
         """Lay out what the kernel reads: views of Pinocchio's data and constant arrays."""
-        robot, n, model = self.robot, self.robot.n_joints, self.robot.model
+        robot, n, model, layout = self.robot, self.robot.n_joints, self.robot.model, self.layout
         frame, limited = model.frames[robot.end_effector_id], self.acceleration_limits is not None
-        moves_tool = np.zeros(n)
-        moves_tool[[model.joints[j].idx_v - 6 for j in model.supports[frame.parentJoint] if j > 1]] = 1.0
         steps = np.full(n, np.inf)
         if self.acceleration_limits is not None and self.sample_time is not None:
             steps = self.acceleration_limits * self.sample_time
         inertial = self.protection.frame == "inertial"
-        scalars = [self.gain, self.damping_threshold, self.damping, robot.mass, float(limited), float(inertial)]
-        parameters = np.array([*scalars, *frame.placement.translation, 1.0, *np.zeros(6)])
-        columns = np.vstack([moves_tool, self.rate_limits, steps])
+        scalars = [self.damping_threshold, self.damping, robot.mass, float(limited), float(inertial)]
+        tool = [frame.parentJoint, *frame.placement.translation]
+        counts = [layout.size, len(layout.level_rows), *layout.target_sizes]
+        parameters = np.array([*scalars, *tool, *counts, 1.0, *np.zeros(6)])
+        joints = list(model.joints)[2:]
+        places, continuous = [float(joint.idx_q) for joint in joints], [float(joint.nq == 2) for joint in joints]
+        columns = np.vstack([self.rate_limits, steps, places, continuous, np.zeros(n), layout.moves])
         data = model.createData()
         # Live views into the Pinocchio data, fetched once: each fetch would cost as much as a tenth of the step.
-        placement = data.oMi[frame.parentJoint]
-        views = (data.Ag, data.J, placement.rotation, placement.translation)
-        constants = (self.protection.U_twist.copy(), columns, parameters)
+        views = (data.Ag, data.J, _placements(data, model.njoints))
+        constants = (self.protection.U_twist.copy(), layout.table, columns, parameters)
         self._prepared = (model, data, views, constants, (*views, *constants))
+        self._reads_joints = bool(np.any(layout.table[:, kernel.KIND] == kernel.JOINTS))
+        self._flat = layout.plain
+        self._at_rest: Floats = np.zeros(layout.target_sizes[1])  # writable, as the kernel wants it; never written
         # Where continuous joints keep cosine and sine: the matrices do not tell whether these fit.
         circles = np.array([joint.idx_q for joint in model.joints[2:] if joint.nq == 2], dtype=np.int64)
         self._circles = circles if circles.size else None
+        self._looks_at_q = self._reads_joints or self._circles is not None
         self._n, self._k = n, self.protection.k
         self._no_rates: Floats = np.zeros(n)
         self._J_base: Floats = np.zeros((6, n))
-        self._matrices: Floats = np.zeros((kernel.MATRICES_SIZE, n))
+        self._matrices: Floats = np.zeros((kernel.J_TASK + layout.size, n))
+        self._later: Floats = np.zeros(layout.target_sizes[0])
+        self._rates: Floats = np.zeros(layout.size)
 
     def __call__(
         self,
         q: ArrayLike,
-        target: ArrayLike,
-        target_velocity: ArrayLike = AT_REST,
+        target: Any,
+        target_velocity: Any = None,
         previous_rates: ArrayLike | None = None,
         protected_rate: ArrayLike | None = None,
         pace: float = 1.0,
@@ -252,8 +352,9 @@ class SelectiveLaw:
 
         Args:
             q: Configuration (nq,).
-            target: Desired end-effector position x_des (3,), m, inertial axes.
-            target_velocity: Its velocity (3,), m/s, inertial axes.
+            target: Desired end-effector position x_des (3,), m, inertial axes; or what the law's only task takes; or,
+                of several tasks, a sequence of what each takes, in their order.
+            target_velocity: Its velocity (3,), m/s, inertial axes, or those of the tasks likewise; None for at rest.
             previous_rates: The joint rates commanded before (n,), rad/s or m/s; needed with an acceleration limit,
                 zeros from rest.
             protected_rate: b (k,), what J_sub q_dot shall be, rad/s, or m/s and rad/s; None for zero. The arm makes it
@@ -268,12 +369,18 @@ class SelectiveLaw:
             The command; its numbers are its own and stay as they are.
 
         Raises:
-            InputError: an argument has the wrong shape or is not finite, q's quaternion is not of unit length, the pace
-                is not in [0, 1], or previous rates are missing.
+            InputError: an argument has the wrong shape or is not finite, a target is no rotation or no direction, q's
+                quaternion is not of unit length, the pace is not in [0, 1], or previous rates are missing.
         """
+        if not self._flat:
+            target = self.layout.flat_targets(target)
+            if target_velocity is not None:
+                target_velocity = self.layout.flat_velocities(target_velocity)
+        if target_velocity is None:
+            target_velocity = self._at_rest
         values = np.empty(self.size)
         self.evaluate(q, target, target_velocity, values, previous_rates, protected_rate, pace)
-        return Command(values, self._n, self._k)
+        return Command(values, self._n, self._k, self.layout)
 
     def evaluate(
         self,
@@ -289,8 +396,9 @@ class SelectiveLaw:
 
         Args:
             q: Configuration (nq,).
-            target: Desired end-effector position (3,), m, inertial axes.
-            target_velocity: Its velocity (3,), m/s, inertial axes.
+            target: Desired end-effector position (3,), m, inertial axes; of other tasks what `layout.flat_targets`
+                makes of their targets.
+            target_velocity: Its velocity (3,), m/s, inertial axes; of other tasks from `layout.flat_velocities`.
             out: Array (law.size,), overwritten: the velocity v (6 + n) and the results that `Command` names.
             previous_rates: The joint rates commanded before (n,).
             protected_rate: b (k,), what J_sub q_dot shall be, as for the call.
@@ -300,7 +408,7 @@ class SelectiveLaw:
             InputError: as for the call.
         """
         if protected_rate is not None or pace != 1.0:
-            _, _, _, (_, _, parameters), _ = self._prepared
+            _, _, _, (*_, parameters), _ = self._prepared
             usual = parameters.copy()
             parameters[kernel.PACE :] = self._asked(protected_rate, pace)
             try:
@@ -312,17 +420,21 @@ class SelectiveLaw:
             if self.acceleration_limits is not None:
                 raise InputError("an acceleration limit needs previous_rates: those commanded before, zeros from rest")
             previous_rates = self._no_rates
-        model, data, _, _, fixed = self._prepared
+        model, data, _, constants, fixed = self._prepared
         try:  # arrays of the right kind are not looked at twice
-            if self._circles is not None and kernel.off_circle(q, self._circles):  # type: ignore[arg-type]
-                self.robot.checked(q)
             centroidal_map(model, data, q)
+            if self._looks_at_q:
+                if self._circles is not None and kernel.off_circle(q, self._circles):  # type: ignore[arg-type]
+                    self.robot.checked(q)
+                if self._reads_joints:
+                    kernel.read_joints(q, constants[2])  # type: ignore[arg-type]
             status = selective_command(*fixed, target, target_velocity, previous_rates, out)  # type: ignore[arg-type]
         except (TypeError, ValueError):  # a list, another layout, a read-only array or a wrong length
             q = self.robot.checked(q)
-            target, target_velocity = _vector("target", target), _vector("target_velocity", target_velocity)
+            target, target_velocity = self._flat_vectors(target, target_velocity)
             previous_rates = self._checked_rates(previous_rates)
             pin.computeCentroidalMap(model, data, q)
+            kernel.read_joints(q, constants[2])
             status = kernel.selective_command(*fixed, target, target_velocity, previous_rates, self._checked_out(out))
         if self.hold_nodes and status == kernel.OK:
             status = self._hold(q, np.asarray(target), np.asarray(target_velocity), np.asarray(previous_rates), out)
@@ -336,6 +448,27 @@ class SelectiveLaw:
         kernel.base_twist_map(views[0], self._J_base)
         return self._J_base @ joint_rates
 
+    def lost_direction(self, q: ArrayLike) -> LostDirection:
+        """Return the direction that the tasks of level 1 can move in least at q, and which protected row takes it.
+
+        It is the left singular vector of the smallest singular value of J_1 N_sub, one of them where there are several.
+
+        Raises:
+            InputError: q has the wrong length or is not finite.
+        """
+        checked = self.robot.checked(q)
+        J, J_sub = (
+            self._task_jacobian(checked)[self.layout.level_rows[0]],
+            self.protection.J_sub(self.robot.coupling(checked)),
+        )
+
+        def left_by(rows: Floats) -> Floats:
+            return J - (J @ np.linalg.pinv(rows)) @ rows if len(rows) else J
+
+        direction = np.linalg.svd(left_by(J_sub))[0][:, -1]
+        without = [float(np.linalg.norm(direction @ left_by(np.delete(J_sub, i, axis=0)))) for i in range(self._k)]
+        return LostDirection(direction, float(np.linalg.norm(direction @ left_by(J_sub))), np.array(without))
+
     def _hold(self, q: ArrayLike, target: Floats, target_velocity: Floats, previous: Floats, out: Floats) -> int:
         """Replace the command at the sample in `out` by the one for the hold.
 
@@ -343,42 +476,61 @@ class SelectiveLaw:
         strongly to the matrices that this need not settle; then the task is given up for this hold, and the last rates
         are only projected on the null space of the mean J_sub, again and again, which settles.
         """
-        model, _, views, (U_c, columns, parameters), _ = self._prepared
+        model, _, views, (_, tasks, columns, parameters), _ = self._prepared
         velocity, results = out[: model.nv], out[model.nv :]
         kernel.base_twist_map(views[0], self._J_base)  # at the sample, as is the base twist that the command tells
-        told = results[kernel.POSITION : kernel.ERROR + 3]
-        at_sample = told.copy()
-        vectors = (target + 0.5 * float(self.sample_time or 0.0) * target_velocity, target_velocity)
-        status, change = self._plan(q, (U_c, columns, parameters, *vectors, previous), out)
+        errors = results[kernel.ERRORS :][: self.layout.size]
+        kept_position, kept_errors = results[kernel.POSITION :][:3].copy(), errors.copy()
+        kernel.advance_targets(tasks, target, target_velocity, 0.5 * float(self.sample_time or 0.0), self._later)
+        status, change = self._plan(q, (columns, parameters), target_velocity, previous, out)
         if status == kernel.OK and change > CONVERGED:
             # A blend of nothing with the given rates, in the kernel's words: their projection.
             columns, parameters, kept = columns.copy(), parameters.copy(), results.copy()
             columns[kernel.RATE_STEP], parameters[kernel.LIMITS_STEPS] = 0.0, 1.0
-            status, change = self._plan(q, (U_c, columns, parameters, *vectors, velocity[6:].copy()), out)
+            status, change = self._plan(q, (columns, parameters), target_velocity, velocity[6:].copy(), out)
             kept[: kernel.POSITION] = results[: kernel.POSITION]
             results[:] = kept
-        told[:] = at_sample  # position and error, as the base twist
+        results[kernel.POSITION :][:3], errors[:] = kept_position, kept_errors  # as the base twist
         results[kernel.PLAN_CHANGE] = change
         return status
 
-    def _plan(self, q: ArrayLike, arguments: tuple[Any, Any, Any, Any, Any, Any], out: Floats) -> tuple[int, float]:
+    def _plan(
+        self, q: ArrayLike, settings: tuple[Floats, Floats], velocities: Floats, previous: Floats, out: Floats
+    ) -> tuple[int, float]:
         """Iterate on mean matrices and command; return the status and the last relative change of the rates."""
-        model, data, _, _, fixed = self._prepared
-        hold, matrices = float(self.sample_time or 0.0), self._matrices
-        velocity, position = out[: model.nv], out[model.nv + kernel.POSITION :][:3]
+        model, data, _, (U_c, tasks, columns, _), fixed = self._prepared
+        hold, matrices, rates, targets = float(self.sample_time or 0.0), self._matrices, self._rates, self._later
+        velocity, results = out[: model.nv], out[model.nv :]
+        position, errors = results[kernel.POSITION :][:3], results[kernel.ERRORS :][: self.layout.size]
         status, change, before = kernel.OK, np.inf, velocity[6:].copy()
         for _ in range(PASSES):
-            matrices[:] = 0.0
-            position[:] = 0.0
+            for total in (matrices, rates, position, errors):
+                total[:] = 0.0
             for node, weight in GAUSS[self.hold_nodes]:
-                pin.computeCentroidalMap(model, data, pin.integrate(model, q, node * hold * velocity))
-                status = status or kernel.add_matrices(*fixed, weight, matrices, position)
-            status = status or kernel.held_command(matrices, *arguments, out)
+                moved = pin.integrate(model, q, node * hold * velocity)
+                pin.computeCentroidalMap(model, data, moved)
+                if self._reads_joints:
+                    kernel.read_joints(moved, columns)
+                status = status or kernel.add_matrices(*fixed, targets, velocities, weight, matrices, rates, out)
+            status = status or kernel.held_command(
+                matrices, U_c, tasks, *settings, targets, velocities, previous, rates, out
+            )
             velocity[:6] = self._J_base @ velocity[6:]
             change = kernel.change_of(velocity[6:], before)
             if status != kernel.OK or change <= CONVERGED:
                 break
         return status, change
+
+    def _flat_vectors(self, target: ArrayLike, velocity: ArrayLike) -> tuple[Floats, Floats]:
+        if self._flat:
+            return _vector("target", target), _vector("target_velocity", velocity)
+        flat = as_floats("target", target), as_floats("target_velocity", velocity)
+        for name, values, size in zip(("target", "target_velocity"), flat, self.layout.target_sizes, strict=True):
+            if values.shape != (size,):
+                raise InputError(
+                    f"{name} has shape {values.shape}; it needs the {size} numbers of law.layout.flat_..(..)"
+                )
+        return flat
 
     def _asked(self, protected_rate: ArrayLike | None, pace: float) -> Floats:
         """Return pace and protected rate as they stand in the kernel's parameters."""
@@ -412,10 +564,13 @@ class SelectiveLaw:
     ) -> None:
         self.robot.checked(q)
         self._checked_rates(rates)
-        for name, value in (("target", target), ("target_velocity", target_velocity)):
-            if not np.all(np.isfinite(_vector(name, value))):
+        vectors = self._flat_vectors(target, target_velocity)
+        for name, value in zip(("target", "target_velocity"), vectors, strict=True):
+            if not np.all(np.isfinite(value)):
                 raise InputError(f"{name} is not finite: {np.asarray(value).tolist()}")
         self._checked_out(out)
+        if status == kernel.NOT_A_TARGET:
+            raise InputError(self.layout.strange_target(np.asarray(target)))
         why = {
             kernel.NO_INERTIA: "the whole robot's inertia H_ww is singular",
             kernel.NOT_UNIT_QUATERNION: "the base quaternion is not of unit length",
@@ -430,6 +585,7 @@ class SelectiveLaw:
             "U_c": self.protection.U_c.tolist(),
             "frame": self.protection.frame,
             "k": self.protection.k,
+            "tasks": [task.describe() for task in self.tasks],
             "gain": self.gain,
             "rate_limits": self.rate_limits.tolist(),
             "damping": self.damping,
@@ -438,6 +594,17 @@ class SelectiveLaw:
             "hold_nodes": self.hold_nodes,
             "acceleration_limits": None if limits is None else limits.tolist(),
         }
+
+
+def _placements(data: pin.Data, joints: int) -> Floats:
+    """Return one live view (joints, 12) of all of `data.oMi`: rotations by columns, translations."""
+    first = data.oMi[0].rotation
+    start, width = first.__array_interface__["data"][0], 12 * first.itemsize
+    for i in range(joints):
+        addresses = [part.__array_interface__["data"][0] for part in (data.oMi[i].rotation, data.oMi[i].translation)]
+        if addresses != [start + i * width, start + i * width + 9 * first.itemsize]:
+            raise RuntimeError("this Pinocchio does not keep its placements one after the other")
+    return np.lib.stride_tricks.as_strided(first, (joints, 12), (width, first.itemsize))
 
 
 def _finite(name: str, value: float) -> float:

@@ -14,7 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, as_floats
 from ssm_decouple.model.appendage import Appendage, Modes, checked_appendages, inspect_remaining_bus
+from ssm_decouple.model.payload import loaded_urdf, payload_body
 from ssm_decouple.model.urdf import inspect_urdf, parse_urdf, root_link, tip_links
+from ssm_decouple.model.wheels import Wheel, wheel_axes, wheeled_urdf
 
 if TYPE_CHECKING:
     from ssm_decouple.model.report import Report
@@ -45,6 +47,7 @@ class Robot:
         model: The `pinocchio.Model`.
         n_joints: Number n of joints after the root.
         joint_names: Names of those joints, in the order of the joint rates.
+        wheel_names: Which of them are reaction wheels, in the same order; see `with_wheels`.
         link_names: Names of the links, each of which is a frame.
         end_effector: Name of the end-effector's frame; the root link where there is no joint.
         end_effector_id: Its Pinocchio frame index.
@@ -85,10 +88,12 @@ class Robot:
         self._neutral: Floats = pin.neutral(self.model)
         self.n_joints: int = self.model.nv - 6
         self.joint_names: tuple[str, ...] = tuple(self.model.names[2:])
+        wheels = wheel_axes(root)
+        self.wheel_names: tuple[str, ...] = tuple(name for name in self.joint_names if name in wheels)
         self.link_names: tuple[str, ...] = tuple(f.name for f in self.model.frames if f.type == pin.FrameType.BODY)
         self.mass: float = pin.computeTotalMass(self.model)
         self.end_effector = self._choose_end_effector(end_effector, tip_links(root), root_link(root))
-        self.end_effector_id: int = self._frame_id(self.end_effector)
+        self.end_effector_id: int = self.frame_id(self.end_effector)
         rates = np.array(self.model.velocityLimit[6:])
         self.rate_limits: Floats = np.where((rates > 0) & (rates < UNLIMITED), rates, np.inf)
         self.position_limits: Floats = self._read_position_limits()
@@ -109,6 +114,60 @@ class Robot:
         robot._data = self.model.createData()  # the model is shared, what is computed on it is not
         robot.appendages = robot._fitting(appendages)
         return robot
+
+    def with_payload(
+        self, mass: float, centre_of_mass: ArrayLike, inertia: ArrayLike, frame: str | None = None
+    ) -> Robot:
+        """Return this robot with a rigid body in its hand.
+
+        The body is a link of the new robot's URDF, called "payload" (or "payload_2" and so on where that is taken), so
+        that the law, the plant, the report and any other tool see it. The end-effector stays where it is.
+
+        Args:
+            mass: kg.
+            centre_of_mass: (3,), m, in the frame's axes, from its origin.
+            inertia: About the centre of mass (3, 3), kg m2, in the frame's axes.
+            frame: The link, or the joint, that holds it; None is the end-effector.
+
+        Raises:
+            InputError: a mass that is not positive, numbers of the wrong shape, or no such frame.
+            ModelError: no body has such an inertia; the message gives its principal moments.
+        """
+        body = payload_body(mass, centre_of_mass, inertia)
+        root = parse_urdf(self.urdf, self.name)
+        try:
+            whole, payload = loaded_urdf(root, body, self.end_effector if frame is None else frame)
+        except InputError as error:
+            raise InputError(f"robot '{self.name}': {error}") from error
+        return self._rebuilt(whole, f"{self.name} + {payload}")
+
+    def with_wheels(self, wheels: Iterable[Wheel]) -> Robot:
+        """Return this robot with these reaction wheels on its root link, beside any that it has.
+
+        Their mass and inertia are part of the root link's already: the whole at rest does not change. Each is a joint
+        of the new robot, so that configurations and joint rates have an entry for it: build configurations by joint
+        name. The law spins wheels as it moves any joint, by the smallest joint rates that do, within their limits.
+
+        Args:
+            wheels: At least one; any number in directions that differ by a degree or more.
+
+        Raises:
+            InputError: none, two of one name, or two about the same axis.
+            ModelError: a name that the URDF has, or wheels that outweigh the root link or leave it no possible inertia.
+        """
+        try:
+            whole = wheeled_urdf(parse_urdf(self.urdf, self.name), wheels)
+        except (InputError, ModelError) as error:
+            raise type(error)(f"robot '{self.name}': {error}") from error
+        text, name = ET.tostring(whole, encoding="unicode"), f"{self.name} + wheels"
+        return Robot(text, name=name, end_effector=self.end_effector, appendages=self.appendages)
+
+    def _rebuilt(self, root: ET.Element, name: str) -> Robot:
+        """Return a robot of a changed URDF, without telling once more of inertias that this one has told of."""
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DecoupleWarning)
+            text = ET.tostring(root, encoding="unicode")
+            return Robot(text, name=name, end_effector=self.end_effector, appendages=self.appendages)
 
     def _fitting(self, appendages: Iterable[Appendage]) -> tuple[Appendage, ...]:
         try:
@@ -160,7 +219,7 @@ class Robot:
                 limits[i] = self.model.lowerPositionLimit[joint.idx_q], self.model.upperPositionLimit[joint.idx_q]
         return limits
 
-    def _frame_id(self, name: str) -> int:
+    def frame_id(self, name: str) -> int:
         """Return the index of a link's frame, else of any other; a joint and a link may share a name."""
         for kinds in (pin.FrameType.BODY, pin.FrameType.OP_FRAME, pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT):
             if self.model.existFrame(name, kinds):
@@ -278,7 +337,7 @@ class Robot:
 
     def frame_pose(self, q: ArrayLike, frame: str | None = None) -> pin.SE3:
         """Return the pose of a frame, by default the end-effector's, in the inertial frame."""
-        index = self.end_effector_id if frame is None else self._frame_id(frame)
+        index = self.end_effector_id if frame is None else self.frame_id(frame)
         pin.framesForwardKinematics(self.model, self._data, self.checked(q))
         return self._data.oMf[index].copy()
 

@@ -187,10 +187,10 @@ def _inspect_joints(root: ET.Element) -> list[Finding]:
 
 def _inspect_inertias(root: ET.Element) -> list[Finding]:
     found, total = [], 0.0
-    moved = {
+    moved = {  # but for rotors, whose mass may well be left in the root link
         joint.find("child").get("link")  # type: ignore[union-attr]
         for joint in root.findall("joint")
-        if joint.get("type") != "fixed" and joint.find("child") is not None
+        if joint.get("type") != "fixed" and joint.find("child") is not None and joint.find("wheel") is None
     }
     for link in root.findall("link"):
         where, inertial = f"link {link.get('name')}", link.find("inertial")
@@ -299,13 +299,13 @@ def root_link(root: ET.Element) -> str:
 
 
 def tip_links(root: ET.Element) -> list[str]:
-    """Return the links at the ends of the branches that at least one joint moves, in file order."""
+    """Return the links at the ends of the branches that at least one joint moves, in file order; no wheel's rotor."""
     joints = {joint.find("child").get("link"): joint for joint in root.findall("joint")}  # type: ignore[union-attr]
     parents = {joint.find("parent").get("link") for joint in joints.values()}  # type: ignore[union-attr]
 
     def moves(link: str | None) -> bool:
         while link in joints:
-            if joints[link].get("type") != "fixed":
+            if joints[link].get("type") != "fixed" and joints[link].find("wheel") is None:
                 return True
             link = joints[link].find("parent").get("link")  # type: ignore[union-attr]
         return False

@@ -9,8 +9,11 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from ssm_decouple.momentum import metrics
+
 if TYPE_CHECKING:
     from ssm_decouple.model.robot import Robot
+    from ssm_decouple.momentum.protection import Protection
 
 Floats = NDArray[np.float64]
 
@@ -31,7 +34,9 @@ class Coupling:
         J_base: Base twist per joint rate (6, n): rows [linear; angular], the velocity of the base origin first.
         J_g: Generalized Jacobian of the end-effector (6, n): rows [linear; angular], always inertial axes, because
             targets are.
+        J_arm: Jacobian of the end-effector with the base held (6, n), in the rows and axes of J_g.
         centre_of_mass: Of the whole (3,), m, inertial axes.
+        base_position: Of the base origin (3,), m, inertial axes.
         base_rotation: Base axes to inertial axes (3, 3).
         mass: Of the whole, kg.
     """
@@ -42,7 +47,9 @@ class Coupling:
     J_rc: Floats
     J_base: Floats
     J_g: Floats
+    J_arm: Floats
     centre_of_mass: Floats
+    base_position: Floats
     base_rotation: Floats
     mass: float
 
@@ -70,7 +77,9 @@ class Coupling:
             J_rc=_fixed(J_base[3:].copy()),
             J_base=_fixed(J_base),
             J_g=_fixed(J_frame[:, 6:] + J_frame[:, :6] @ J_base),
+            J_arm=_fixed(J_frame[:, 6:].copy()),
             centre_of_mass=_fixed(data.com[0] + position),
+            base_position=_fixed(position),
             base_rotation=_fixed(R),
             mass=robot.mass,
         )
@@ -97,6 +106,90 @@ class Coupling:
     def base_twist(self, joint_rates: ArrayLike) -> Floats:
         """Return the base twist (6,) that joint rates (n,) cause: [linear; angular], m/s and rad/s, axes of `frame`."""
         return self.J_base @ np.asarray(joint_rates, dtype=float)
+
+    def manipulability(
+        self, protection: Protection | None = None, characteristic_length: float | None = None
+    ) -> metrics.Ellipsoid:
+        """Return how fast the end-effector can go in each direction with |q_dot| <= 1 and the protected axes still.
+
+        The ellipsoid of J_gt N_sub: `volume` is Yoshikawa's manipulability (1985), `smallest` the law's
+        `smallest_singular_value`. With `Protection("all")` the joint rates are those of the reaction null space
+        (Nenchev, Umetani and Yoshida, 1992). Directions are in inertial axes; the semi-axes depend on no frame, nor on
+        the base pose.
+
+        Args:
+            protection: What the base must not do; None allows all joint rates.
+            characteristic_length: Length L, m, that turns angular speeds into linear ones: the ellipsoid is then that
+                of [J_gt; L J_gw] N_sub, rows [linear; angular times L]. None takes the translation alone.
+
+        Returns:
+            The ellipsoid, r = 3 or, with a characteristic length, 6; semi-axes in m (m/s per rad/s).
+
+        Raises:
+            InputError: the characteristic length is no positive number.
+        """
+        return metrics.manipulability(self, protection, characteristic_length)
+
+    def directional_coupling(self) -> metrics.Ellipsoid:
+        """Return about which axes the joints turn the base, and how much: the ellipsoid of J_rc.
+
+        Its first direction is the axis about which joint rates with |q_dot| <= 1 turn the base most, at semi_axes[0]
+        rad/s, its first column of joint rates is how; the last are those that turn it least. Disturbance maps
+        (Vafa and Dubowsky, 1990; Torres and Dubowsky, 1992) are drawn from it. Directions are in the axes of `frame`.
+
+        Returns:
+            The ellipsoid, r = 3, semi-axes in rad/s per rad/s. Joint rates orthogonal to those of all semi-axes above
+            zero leave the base's attitude alone.
+        """
+        return metrics.Ellipsoid.of(self.J_rc)
+
+    def coupling_factor(self, protection: Protection | None = None) -> float:
+        """Return the largest base angular speed, rad/s, per m/s of the end-effector: |J_rc (J_gt N_sub)^+|.
+
+        In the manner of Xu's coupling factor (1993) between the motions of end-effector and base: the spectral norm,
+        over the velocities that the end-effector can have, each made by the smallest joint rates. It grows without
+        bound towards a singularity. 0 where nothing that is allowed turns the base: all three axes protected.
+
+        Args:
+            protection: What the base must not do; None allows all joint rates.
+        """
+        return metrics.coupling_factor(self, protection)
+
+    def dynamic_singularity_margin(self, protection: Protection | None = None) -> float:
+        """Return the smallest singular value of J_gt N_sub over that of J_arm, both of translations.
+
+        Only directions in which the arm on a held base can go count, so that it says something of planar arms too. 0 is
+        a dynamic singularity (Papadopoulos and Dubowsky, 1993): the arm on a held base can go in every such direction,
+        on the free one it cannot, and where depends on masses. 1 is an arm that does not feel that its base is free, as
+        on a very heavy one; above 1 the base's reaction helps. With a protection, what that takes comes on top. NaN
+        where the arm cannot move its end-effector at all.
+
+        Args:
+            protection: What the base must not do; None allows all joint rates.
+        """
+        return metrics.dynamic_singularity_margin(self, protection)
+
+    def protected_share(self, protection: Protection, joint_rates: ArrayLike) -> float:
+        """Return which share of the momentum that joint rates give the base is about the protected directions.
+
+        At zero total momentum the base takes h = -H_wq q_dot = H_ww omega. It has two parts, orthogonal in the
+        rotational energy h^T H_ww^-1 h / 2: one along the protected directions, and one that turns the base about none
+        of them. The share is that of the first in the energy. (The plain projection of h would not do: H_ww is not
+        isotropic, so that a base which does not turn about an axis may well have momentum about it.) With six-row
+        directions h is the whole momentum, linear and angular, and the energy that of the whole with its joints locked.
+
+        Args:
+            protection: The directions.
+            joint_rates: (n,), rad/s or m/s; their size plays no part.
+
+        Returns:
+            Share from 0, the base does not move along the protected directions, to 1, all of its momentum is along
+            them. 0 where the rates give the base no momentum. It depends on no frame, nor on the base pose.
+
+        Raises:
+            InputError: the rates have the wrong length or are not finite.
+        """
+        return metrics.protected_share(self, protection, joint_rates)
 
 
 def _fixed(array: Floats) -> Floats:

@@ -114,6 +114,9 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
 }
 
 
+_TASK_ERROR = {"units": "m or rad", "frame": "as the task says", "long_name": "error of each task row"}
+
+
 def protected_integral(U_twist: Floats, frame: str, twists: Floats, configurations: Floats) -> Floats:
     """Return how far the base has moved along directions of its twist since the start (m, k), m and rad.
 
@@ -165,7 +168,7 @@ def build_motion(
         configurations: Configurations (m, nq).
         values: The law's output arrays (m, law.size).
         twists: Integral of the base twist, base axes (m, 6), m and rad.
-        targets: Target positions (m, 3), m, inertial axes.
+        targets: Flat targets (m, size): of one position, that position (m, 3), m, inertial axes.
 
     Returns:
         The motion; its variables are listed in the documentation of `simulate`.
@@ -174,7 +177,9 @@ def build_motion(
 
     robot, model = law.robot, law.robot.model
     n, k, m = robot.n_joints, law.protection.k, time.size
-    results = values[:, 6 + n :]
+    results, layout = values[:, 6 + n :], law.layout
+    errors = results[:, kernel.ERRORS : kernel.ERRORS + layout.size]
+    nowhere = np.full((m, 3), np.nan)
     attitude = Rotation.from_quat(configurations[:, 3:7])
     momenta, centres = np.empty((m, 6)), np.empty((m, 3))
     data = model.createData()
@@ -196,13 +201,15 @@ def build_motion(
         "base_twist_integral": twists,
         "protected_angle": protected_integral(law.protection.U_twist, law.protection.frame, twists, configurations),
         "end_effector_position": results[:, kernel.POSITION : kernel.POSITION + 3],
-        "target_position": targets,
-        "end_effector_error": np.linalg.norm(results[:, kernel.ERROR : kernel.ERROR + 3], axis=1),
-        "smallest_singular_value": results[:, kernel.SMALLEST_SINGULAR_VALUE],
+        "target_position": nowhere if layout.tool_target is None else targets[:, layout.tool_target],
+        "end_effector_error": np.linalg.norm(
+            nowhere if layout.tool_position is None else errors[:, layout.tool_position], axis=1
+        ),
+        "smallest_singular_value": results[:, kernel.ERRORS + layout.size],
         "rate_scale": results[:, kernel.RATE_SCALE],
         "rate_blend": results[:, kernel.RATE_BLEND],
         "plan_change": results[:, kernel.PLAN_CHANGE],
-        "damping": results[:, kernel.DAMPING],
+        "damping": results[:, kernel.ERRORS + layout.size + 1],
         "linear_momentum": momenta[:, :3],
         "angular_momentum": momenta[:, 3:],
         "centre_of_mass": centres,
@@ -221,6 +228,9 @@ def build_motion(
         "protected": list(range(1, k + 1)),
         "quaternion": ["x", "y", "z", "w"],
     }
+    if not layout.usual:
+        variables["task_error"] = xr.Variable(("time", "task_row"), errors, _TASK_ERROR, fastpath=True)
+        coordinates |= {"task_row": list(layout.row_names), "task_level": ("task_row", np.array(layout.row_levels))}
     return xr.Dataset(variables, coordinates, _attributes(law))
 
 

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.control.law import AT_REST, SelectiveLaw
+from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_floats, as_not_negative
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import build_motion, judge
@@ -19,7 +19,7 @@ from ssm_decouple.simulation.steps import STEPS, Pace, Reference
 
 Floats = NDArray[np.float64]
 Method = Literal["explicit", "held", "rk4"]
-Target = Callable[[float], tuple[ArrayLike, ArrayLike]]
+Target = Callable[[float], tuple[Any, Any]]
 Progress = Callable[[float], object]
 
 
@@ -45,7 +45,7 @@ class DivergenceError(DecoupleError, ArithmeticError):
 def simulate(
     law: SelectiveLaw,
     q: ArrayLike,
-    target: ArrayLike | Target,
+    target: Any | Target,
     duration: float,
     dt: float,
     method: Method | Dynamic = "explicit",
@@ -59,8 +59,8 @@ def simulate(
     Args:
         law: The law, called at every sample.
         q: Start configuration (nq,).
-        target: Desired end-effector position (3,), m, inertial axes; or a function of time, s, that returns position
-            and velocity.
+        target: Desired end-effector position (3,), m, inertial axes, or what the law's tasks take; or a function of
+            time, s, that returns this and its velocity.
         duration: Length of the motion, s.
         dt: Time between samples, s. A last shorter step is taken where `duration` is no multiple of it.
         method: "explicit" holds joint rates and base twist for one step, how we read the paper. "held" holds the joint
@@ -68,7 +68,8 @@ def simulate(
             the truth for a sampled law. "rk4" is a fourth-order Lie-group Runge-Kutta method that calls the law within
             the step too, and so integrates the law in continuous time. A `Dynamic` solves the equations of motion:
             joints driven by torques, appendages that bend, a plant that differs from the model.
-        arrival_tolerance: Distance, m, within which the end-effector has arrived.
+        arrival_tolerance: Distance, m, within which the end-effector has arrived. Of other tasks the norm of all errors
+            of level 1, m and rad.
         stop_early: End when the end-effector has arrived or has stalled instead of after `duration`.
         progress: Called now and then with the share done, 0 to 1.
         smooth_start: Time, s, over which the law's pace rises from 0 to 1 as 10 x^3 - 15 x^4 + 6 x^5, so that rates and
@@ -81,10 +82,12 @@ def simulate(
         end_effector_position, target_position, end_effector_error, smallest_singular_value, rate_scale, rate_blend,
         plan_change, damping, linear_momentum, angular_momentum, centre_of_mass, U_c, robot_urdf. Attributes: `outcome`
         ("converged", "stalled" or "running"), `outcome_time` (s), `final_error` (m), the law's settings, the method
-        and the versions. A dynamic motion has also joint_velocities, joint_torques, hinge_angles, tip_deflection,
-        kinetic_energy, spring_energy, drive_work, load_work, damping_loss, saturated_time, and the attributes
-        `physics`, `energy_error`, `momentum_drift` (both relative), `largest_torques` and `saturated`: from when to
-        when a drive stood at its torque limit.
+        and the versions. With other tasks than the end-effector's position there is also `task_error` (time, task_row),
+        m or rad, as the law sees it, each row with its name and `task_level`; where no task asks for a position of the
+        end-effector, its target and error are not numbers. A dynamic motion has also joint_velocities, joint_torques,
+        hinge_angles, tip_deflection, kinetic_energy, spring_energy, drive_work, load_work, damping_loss,
+        saturated_time, and the attributes `physics`, `energy_error`, `momentum_drift` (both relative),
+        `largest_torques` and `saturated`: from when to when a drive stood at its torque limit.
 
     Raises:
         InputError: an argument makes no sense; the message names it.
@@ -97,9 +100,10 @@ def simulate(
     _refuse_unfit_method(law, method, duration, dt)
     if not (np.isfinite(arrival_tolerance) and arrival_tolerance > 0):
         raise InputError(f"arrival_tolerance is {arrival_tolerance}; it must be a positive distance, m")
-    pace, reference = _smooth_pace(smooth_start), _reference(target)
+    pace, reference = _smooth_pace(smooth_start), _reference(law, target)
     run = _Run(law, law.robot.checked(q).copy(), time, reference, pace, method)
-    _warn_out_of_reach(law, run.configurations[0], reference(0.0)[0])
+    if law.layout.tool_target is not None:
+        _warn_out_of_reach(law, run.configurations[0], reference(0.0)[0][law.layout.tool_target])
     run.settings = {"arrival_tolerance": arrival_tolerance, "smooth_start": float(smooth_start)}
     tick = max(1, time.size // 100)
     try:
@@ -141,10 +145,10 @@ class _Run:
         self.configurations = np.empty((samples, start.size))
         self.configurations[0] = start
         self.twists = np.zeros((samples, 6))
-        self.targets = np.empty((samples, 3))
+        self.targets = np.empty((samples, law.layout.target_sizes[0]))
         self.values = np.empty((samples, law.size))
         self.rates = self.values[:, 6 : 6 + n]
-        self.errors = self.values[:, 6 + n + kernel.ERROR : 9 + n + kernel.ERROR]
+        self.errors = self.values[:, 6 + n + kernel.ERRORS :][:, law.layout.level_rows[0]]
         self.at_rest = np.zeros(n)
         self.done = 0
         self.settings: dict[str, float] = {}
@@ -174,7 +178,7 @@ class _Run:
     def ended(self, tolerance: float) -> bool:
         """Say whether the end-effector has arrived or has stalled."""
         error = np.linalg.norm(self.errors[: self.done], axis=1)
-        return judge(self.time[: self.done], error, tolerance, 1.0 / self.law.gain).name != "running"
+        return judge(self.time[: self.done], error, tolerance, 1.0 / self.law.layout.slowest_gain).name != "running"
 
     def record(self) -> xr.Dataset:
         """Return the motion so far."""
@@ -184,8 +188,10 @@ class _Run:
         )
         if self.dynamic is not None:
             motion = self.dynamic.complete(motion)
-        tolerance = self.settings["arrival_tolerance"]
-        outcome = judge(time, motion.end_effector_error.values, tolerance, 1.0 / law.gain)
+        tolerance, error = self.settings["arrival_tolerance"], motion.end_effector_error.values
+        if not law.layout.usual:
+            error = np.linalg.norm(self.errors[:done], axis=1)
+        outcome = judge(time, error, tolerance, 1.0 / law.layout.slowest_gain)
         motion.attrs |= {
             "method": "dynamic" if self.dynamic is not None else self.method,
             **self.settings,
@@ -237,19 +243,33 @@ def _sample_times(duration: float, dt: float) -> Floats:
     return time
 
 
-def _reference(target: ArrayLike | Target) -> Reference:
+def _reference(law: SelectiveLaw, target: Any | Target) -> Reference:
+    """Return the flat targets and velocities as a function of time."""
+    at_rest = law.layout.flat_velocities(None)
     if callable(target):
 
         def moving(time: float) -> tuple[Floats, Floats]:
             try:
                 position, velocity = target(time)
             except (TypeError, ValueError):
-                raise InputError("a target function returns two things: position (3,) and velocity (3,)") from None
-            return _point(position, "target position"), _point(velocity, "target velocity")
+                raise InputError(
+                    "a target function returns two things: position (3,) and velocity (3,), or what the tasks take and "
+                    "its velocity"
+                ) from None
+            if law.layout.plain:
+                return _point(position, "target position"), _point(velocity, "target velocity")
+            velocities = _finite(law.layout.flat_velocities(velocity), "target velocity")
+            return _finite(law.layout.flat_targets(position), "target"), velocities
 
         return moving
-    fixed = _point(target, "target")
-    return lambda _: (fixed, AT_REST)
+    fixed = _point(target, "target") if law.layout.plain else _finite(law.layout.flat_targets(target), "target")
+    return lambda _: (fixed, at_rest)
+
+
+def _finite(values: Floats, name: str) -> Floats:
+    if not np.all(np.isfinite(values)):
+        raise InputError(f"{name} is not finite: {values.tolist()}")
+    return values
 
 
 def _point(value: ArrayLike, name: str) -> Floats:
