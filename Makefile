@@ -9,7 +9,7 @@ cases: .venv/installed
 	$(BIN)/ssm-decouple compare all --output results
 
 test: .venv/installed-dev
-	$(BIN)/python -m pytest
+	$(BIN)/python -m pytest -n auto --dist worksteal
 
 slow: .venv/installed-dev
 	$(BIN)/python -m pytest -m slow
