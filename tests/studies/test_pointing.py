@@ -47,7 +47,7 @@ def test_the_table_and_the_figure_tell_the_rows(found):
     assert len(pointing_table([row for row, _ in found.values()])) == 7
     top, _ = figures.pointing({law: motion for law, (_, motion) in found.items()}).axes
     wander = ARCSEC * pointing_error(found["none"][1], [0, 1, 0])
-    np.testing.assert_allclose(top.lines[0].get_ydata(), np.maximum(wander[1:], 1e-8))
+    np.testing.assert_allclose(top.lines[0].get_ydata(), np.maximum(wander[1:], 1e-12))
 
 
 def test_a_boresight_of_zero_is_refused():

@@ -240,7 +240,7 @@ def pointing(motions: Mapping[str, xr.Dataset]) -> Figure:
     for law, motion in motions.items():
         line: dict[str, Any] = {**LAW_LINES.get(law, {}), "label": law, "linewidth": 0.9}
         wander = ARCSEC * pointing_error(motion, motion.attrs["boresight"])
-        top.semilogy(motion.time[1:], np.maximum(wander[1:], 1e-8), **line)
+        top.semilogy(motion.time[1:], np.maximum(wander[1:], 1e-12), **line)
         bottom.semilogy(motion.time, 1e3 * motion.end_effector_error, **line)
     top.set_ylabel("pointing error (arcsec)")
     bottom.set_ylabel("distance to target (mm)")
