@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssm_decouple.control.kernel import compiled, compiled_for
+from ssm_decouple.control.kernel import compiled
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -545,15 +545,7 @@ def split(driven: Ints, size: int, prescribed: bool) -> tuple[Ints, Ints]:
     return np.flatnonzero(~is_given), np.flatnonzero(is_given)
 
 
-_INTS, _ROWS, _VECTOR = "int64[::1]", "float64[:, ::1]", "float64[::1]"
-ADVANCE = (
-    f"int64({_INTS}, {_ROWS}, {_ROWS}, {_INTS}, {_INTS}, {_ROWS}, "
-    f"{_VECTOR}, {_ROWS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_ROWS}, "
-    f"{_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR})"
-)
-
-
-@compiled_for(ADVANCE)
+@compiled  # when first called: who simulates without torques does not wait for it
 def advance(
     parent: Ints,
     tree: Floats,
