@@ -38,7 +38,7 @@ wheel: .venv/installed-dev
 	cd $$(mktemp -d) && $(CURDIR)/.venv-wheel/bin/ssm-decouple run case1 --no-progress && ls results/case1
 	rm -rf .venv-wheel
 
-benchmarks: .venv/installed-bench
+benchmarks: .venv/installed-dev
 	$(BIN)/python benchmarks/control_step.py
 	$(BIN)/python benchmarks/dynamic.py
 	$(BIN)/python benchmarks/start_up.py
@@ -60,7 +60,3 @@ clean:
 	@echo "installing into .venv, two minutes or so"
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $@ .venv/installed
-
-.venv/installed-bench: pyproject.toml .venv/bin/python
-	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev,bench]'
-	touch $@ .venv/installed .venv/installed-dev

@@ -38,6 +38,18 @@ def as_floats(name: str, value: ArrayLike) -> NDArray[np.float64]:
         raise InputError(f"{name} is {value!r}; it needs real numbers") from None
 
 
+def as_triple(name: str, value: ArrayLike, axes: str = "") -> NDArray[np.float64]:
+    """Return three finite numbers (3,).
+
+    Raises:
+        InputError: they are not; the message calls them `name` and says in which axes they are wanted.
+    """
+    vector = as_floats(name, value)
+    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
+        raise InputError(f"{name} is {vector.tolist()}; it needs 3 finite numbers{axes and f', {axes}'}")
+    return vector
+
+
 def as_positive(name: str, value: float) -> float:
     """Return a number that has to be finite and above zero.
 

@@ -6,6 +6,7 @@ import mujoco
 import numpy as np
 import pinocchio as pin
 import pytest
+from mujoco_robots import mass_matrix, mujoco_model
 from random_robots import random_state
 
 import ssm_decouple as ssm
@@ -77,24 +78,6 @@ def test_the_motion_it_predicts_conserves_momentum(robot, rng):
         np.testing.assert_array_equal(coupling.J_gt, coupling.J_g[:3])
 
 
-def mujoco_model(robot: ssm.Robot) -> mujoco.MjModel:
-    """Build the same URDF in MuJoCo, free to float, without gravity."""
-    import xml.etree.ElementTree as ET
-
-    root = ET.fromstring(robot.urdf)
-    for link in root.findall("link"):
-        for kind in ("visual", "collision"):
-            for shape in link.findall(kind):
-                link.remove(shape)
-    options = ET.SubElement(root, "mujoco")
-    ET.SubElement(options, "compiler", fusestatic="false", strippath="false", boundmass="0", boundinertia="0")
-    spec = mujoco.MjSpec.from_string(ET.tostring(root, encoding="unicode"))
-    spec.option.gravity = [0, 0, 0]
-    first = spec.worldbody.first_body()
-    first.add_freejoint(name="root")
-    return spec.compile()
-
-
 def test_mujoco_agrees(robot, rng):
     model = mujoco_model(robot)
     data = mujoco.MjData(model)
@@ -107,9 +90,7 @@ def test_mujoco_agrees(robot, rng):
         data.qpos[root_q + 3 : root_q + 7] = q[[6, 3, 4, 5]]  # MuJoCo's quaternion starts with w
         data.qpos[addresses] = robot.joint_positions(q)
         mujoco.mj_forward(model, data)
-        M = np.empty((model.nv, model.nv))
-        for i, unit in enumerate(np.eye(model.nv)):
-            mujoco.mj_mulM(model, data, M[i], unit)
+        M = mass_matrix(model, data)
         base = list(range(root_v, root_v + 6))
         J_base = -np.linalg.solve(M[np.ix_(base, base)], M[np.ix_(base, columns)])
         coupling = robot.coupling(q)

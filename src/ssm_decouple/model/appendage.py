@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.errors import InputError, ModelError
-from ssm_decouple.model.urdf import Body, Finding, inspect_urdf, read_body, root_link, triple, write_body
+from ssm_decouple.model.urdf import Body, Finding, inspect_urdf, read_body, refuse_twins, root_link, triple, write_body
 
 Floats = NDArray[np.float64]
 
@@ -300,10 +300,7 @@ def checked_appendages(appendages: Iterable[Appendage]) -> tuple[Appendage, ...]
     for appendage in found:
         if not isinstance(appendage, Appendage):
             raise InputError(f"{appendage!r} is no appendage; build it with ssm_decouple.Appendage(..)")
-    names = [appendage.name for appendage in found]
-    twice = [name for i, name in enumerate(names) if name in names[:i]]
-    if twice:
-        raise InputError(f"two appendages are called '{twice[0]}'; rename one")
+    refuse_twins("appendages", [appendage.name for appendage in found])
     return found
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -13,7 +13,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from ssm_decouple.errors import ModelError
+from ssm_decouple.errors import InputError, ModelError
 
 ONE_DOF_JOINTS = ("revolute", "continuous", "prismatic")
 Level = Literal["note", "suspicious", "impossible"]
@@ -261,6 +261,17 @@ class Body:
     def _about(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
         arm = self.centre - point
         return self.inertia + self.mass * (arm @ arm * np.eye(3) - np.outer(arm, arm))
+
+
+def refuse_twins(kind: str, names: Sequence[str]) -> None:
+    """Refuse a name that stands twice.
+
+    Raises:
+        InputError: one does; the message calls what is so named `kind`, in the plural.
+    """
+    twice = [name for i, name in enumerate(names) if name in names[:i]]
+    if twice:
+        raise InputError(f"two {kind} are called '{twice[0]}'; rename one")
 
 
 def read_body(link: ET.Element) -> Body:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.errors import InputError, ModelError, as_floats
-from ssm_decouple.model.urdf import Body, floats, read_body, root_link, triple, write_body
+from ssm_decouple.model.urdf import Body, floats, read_body, refuse_twins, root_link, triple, write_body
 
 Floats = NDArray[np.float64]
 
@@ -131,10 +131,7 @@ def _checked(wheels: Iterable[Wheel]) -> list[Wheel]:
     for wheel in found:
         if not isinstance(wheel, Wheel):
             raise InputError(f"{wheel!r} is no wheel; build it with ssm_decouple.Wheel(..)")
-    names = [wheel.name for wheel in found]
-    twice = [name for i, name in enumerate(names) if name in names[:i]]
-    if twice:
-        raise InputError(f"two wheels are called '{twice[0]}'; rename one")
+    refuse_twins("wheels", [wheel.name for wheel in found])
     return found
 
 

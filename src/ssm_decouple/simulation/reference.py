@@ -12,7 +12,7 @@ from scipy.integrate import DOP853
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from ssm_decouple.errors import InputError, as_floats
+from ssm_decouple.errors import InputError, as_floats, as_triple
 from ssm_decouple.model.payload import possible_inertia
 from ssm_decouple.model.robot import rigid_pose
 
@@ -139,11 +139,11 @@ class TumblingTarget:
         if rotation.shape != (3, 3):
             raise InputError(f"target attitude has shape {rotation.shape}; it needs a rotation matrix (3, 3)")
         start[:3, :3] = rotation
-        start[:3, 3] = _triple("target position", position)
+        start[:3, 3] = as_triple("target position", position)
         self._start = rigid_pose("target attitude", start)
-        self._velocity = _triple("target velocity", velocity)
-        self._grasp = _triple("target grasp_point", grasp_point)
-        spin = _triple("target angular_velocity", angular_velocity)
+        self._velocity = as_triple("target velocity", velocity)
+        self._grasp = as_triple("target grasp_point", grasp_point)
+        spin = as_triple("target angular_velocity", angular_velocity)
         R = self._start.rotation
         self.angular_momentum: Floats = R @ self._inertia @ R.T @ spin
         self.angular_momentum.flags.writeable = False
@@ -230,13 +230,6 @@ def _rising(name: str, values: ArrayLike) -> Floats:
     if times.ndim != 1 or times.size < 2 or not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
         raise InputError(f"{name} are {times.tolist()}; they need two or more finite numbers that rise, s")
     return times
-
-
-def _triple(name: str, value: ArrayLike) -> Floats:
-    vector = as_floats(name, value)
-    if vector.shape != (3,) or not np.all(np.isfinite(vector)):
-        raise InputError(f"{name} is {vector.tolist()}; it needs 3 finite numbers")
-    return vector
 
 
 def _finite_time(time: float) -> float:

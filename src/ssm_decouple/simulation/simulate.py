@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_floats, as_not_negative
+from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_not_negative, as_triple
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import build_motion, judge
 from ssm_decouple.simulation.steps import STEPS, Pace, Reference
@@ -257,12 +257,19 @@ def _reference(law: SelectiveLaw, target: Any | Target) -> Reference:
                     "its velocity"
                 ) from None
             if law.layout.plain:
-                return _point(position, "target position"), _point(velocity, "target velocity")
+                return (
+                    as_triple("target position", position, "inertial axes"),
+                    as_triple("target velocity", velocity, "inertial axes"),
+                )
             velocities = _finite(law.layout.flat_velocities(velocity), "target velocity")
             return _finite(law.layout.flat_targets(position), "target"), velocities
 
         return moving
-    fixed = _point(target, "target") if law.layout.plain else _finite(law.layout.flat_targets(target), "target")
+    fixed = (
+        as_triple("target", target, "inertial axes")
+        if law.layout.plain
+        else _finite(law.layout.flat_targets(target), "target")
+    )
     return lambda _: (fixed, at_rest)
 
 
@@ -270,13 +277,6 @@ def _finite(values: Floats, name: str) -> Floats:
     if not np.all(np.isfinite(values)):
         raise InputError(f"{name} is not finite: {values.tolist()}")
     return values
-
-
-def _point(value: ArrayLike, name: str) -> Floats:
-    point = as_floats(name, value)
-    if point.shape != (3,) or not np.all(np.isfinite(point)):
-        raise InputError(f"{name} is {point.tolist()}; it needs 3 finite numbers, inertial axes")
-    return point
 
 
 def _warn_out_of_reach(law: SelectiveLaw, q: Floats, target: Floats) -> None:

@@ -128,6 +128,8 @@ class Case:
     def robot(self) -> Robot:
         """The robot, loaded when first asked for, its appendages turned as the case has them."""
         robot = load_robot(self.robot_source, self.end_effector)
+        if not self.turned:
+            return robot
         known = {visual.get("name", "") for visual in ET.fromstring(robot.urdf).iter("visual")}
         known |= {appendage.name for appendage in robot.appendages}
         for name in self.turned:
