@@ -23,6 +23,7 @@ from ssm_decouple.cli.shared import (
     NoFigures,
     NoProgress,
     Output,
+    Products,
     complain,
     escape_markup,
     file_name,
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
     import xarray as xr
 
     from ssm_decouple.studies.case import Case
-    from ssm_decouple.studies.comparison import Summary
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -233,18 +233,8 @@ def cases(as_json: AsJson = False) -> None:
         typer.echo(f"{name:<13} {titles[name]}\n{'':<13} {path}")
 
 
-class _Work:
-    """What a run has produced so far, so that an interruption keeps it."""
-
-    def __init__(self, folder: Path, no_figures: bool, as_json: bool) -> None:
-        from ssm_decouple.files import writable_folder
-
-        self.folder = writable_folder(folder)
-        self.no_figures = no_figures
-        self.as_json = as_json
-        self.rows: list[Summary] = []
-        self.files: list[Path] = []
-        self.interrupted = False
+class _Work(Products):
+    """Motions under laws, with their summaries, so that an interruption keeps them."""
 
     @contextmanager
     def collecting(self) -> Iterator[None]:
@@ -266,13 +256,6 @@ class _Work:
         except KeyboardInterrupt:
             self.interrupted = True
 
-    def keep_motion(self, case: Case, law: str, motion: xr.Dataset) -> None:
-        from ssm_decouple.files import writable_folder
-        from ssm_decouple.simulation.motion import save_motion
-
-        place = writable_folder(self.folder / case.name)
-        self.files.append(save_motion(motion, place / f"{file_name(law)}.nc"))
-
     def draw(self, case: Case, law: str, motion: xr.Dataset) -> None:
         if not self.no_figures:
             from ssm_decouple.viewing.figures import save_figures
@@ -280,20 +263,16 @@ class _Work:
             self.files += save_figures(motion, self.folder / case.name, file_name(law))
 
     def draw_comparison(self, case: Case, motions: dict[str, xr.Dataset]) -> None:
-        if not self.no_figures:
-            from ssm_decouple.viewing.figures import comparison
-            from ssm_decouple.viewing.style import save
+        from ssm_decouple.viewing.figures import comparison
 
-            self.files += save(comparison(motions), self.folder / case.name, "comparison")
+        self.draw_sheet(f"{case.name}/comparison", comparison, motions)
 
     def report(self) -> None:
         """Print the rows, the reasons and where the files are; leave with the interrupted status if it was."""
         from ssm_decouple.viewing.table import explain, saturation, terminal_table
 
         if self.as_json:
-            rows: list[dict[str, Any]] = [dataclasses.asdict(row) for row in self.rows]
-            found = {"interrupted": self.interrupted, "rows": rows, "files": [str(path) for path in self.files]}
-            typer.echo(json.dumps(found, indent=2))
+            self.print_json()
         elif self.rows:
             print_table(terminal_table(self.rows))
             for row in self.rows:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -16,6 +17,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from ssm_decouple.errors import InputError
 
 if TYPE_CHECKING:
+    import xarray as xr
+    from matplotlib.figure import Figure
     from rich.table import Table
 
     from ssm_decouple.studies.case import Case
@@ -52,6 +55,42 @@ def load(names: list[str], damping: float | None = None, dynamic: bool = False) 
             for case in loaded
         ]
     return loaded
+
+
+class Products:
+    """What a command has produced so far: rows of results and files."""
+
+    def __init__(self, folder: Path, no_figures: bool, as_json: bool) -> None:
+        from ssm_decouple.files import writable_folder
+
+        self.folder = writable_folder(folder)
+        self.no_figures = no_figures
+        self.as_json = as_json
+        self.rows: list[Any] = []
+        self.files: list[Path] = []
+        self.interrupted = False
+
+    def keep_motion(self, case: Case, name: str, motion: xr.Dataset) -> None:
+        """Write a motion into its case's folder."""
+        from ssm_decouple.files import writable_folder
+        from ssm_decouple.simulation.motion import save_motion
+
+        place = writable_folder(self.folder / case.name)
+        self.files.append(save_motion(motion, place / f"{file_name(name)}.nc"))
+
+    def draw_sheet(self, name: str, figure: Callable[[Any], Figure], subject: Any) -> None:
+        """Draw one figure, its name being a path under the folder, unless none are wanted."""
+        if not self.no_figures:
+            from ssm_decouple.viewing.style import save
+
+            place = self.folder / name
+            self.files += save(figure(subject), place.parent, place.name)
+
+    def print_json(self) -> None:
+        """Print rows and files as JSON."""
+        rows = [dataclasses.asdict(row) for row in self.rows]
+        found = {"interrupted": self.interrupted, "rows": rows, "files": [str(path) for path in self.files]}
+        typer.echo(json.dumps(found, indent=2))
 
 
 def print_table(table: Table) -> None:

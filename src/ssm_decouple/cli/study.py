@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -19,8 +17,8 @@ from ssm_decouple.cli.shared import (
     NoFigures,
     NoProgress,
     Output,
+    Products,
     complain,
-    file_name,
     load,
     print_table,
     progress_bar,
@@ -28,10 +26,8 @@ from ssm_decouple.cli.shared import (
 from ssm_decouple.errors import DecoupleError, InputError
 
 if TYPE_CHECKING:
-    import xarray as xr
     from matplotlib.figure import Figure
 
-    from ssm_decouple.studies.case import Case
 
 study = typer.Typer(no_args_is_help=True, help="Parameter studies of cases.")
 
@@ -101,7 +97,7 @@ def study_bending(
             for row, motion in runs:
                 motions[row.protection] = motion
                 work.rows.append(row)
-                work.keep_motion(case, row.protection, motion)
+                work.keep_motion(case, f"bending_{row.protection}", motion)
             work.draw(f"{case.name}/bending", figures.bending, (case, motions))
     work.report({"deflection of the appendages' tips": bending_table(work.rows)})
 
@@ -135,7 +131,7 @@ def study_pointing(
             for row, motion in pointing(case, line, Dynamic(step=step), partial(show, case.name)):
                 motions[row.law] = motion
                 work.rows.append(row)
-                work.keep_motion(case, row.law, motion)
+                work.keep_motion(case, f"pointing_{row.law}", motion)
             work.draw(f"{case.name}/pointing", figures.pointing, motions)
     work.report({f"angle between the line of sight ({boresight}) and where it looked": pointing_table(work.rows)})
 
@@ -190,19 +186,12 @@ def study_robustness(
     )
 
 
-class _Study:
-    """What a study has produced so far, so that an interruption keeps it."""
+class _Study(Products):
+    """Rows of a study, with its motions, so that an interruption or an error keeps them."""
 
     def __init__(self, name: str, folder: Path, no_figures: bool, as_json: bool) -> None:
-        from ssm_decouple.files import writable_folder
-
+        super().__init__(folder, no_figures, as_json)
         self.name = name
-        self.folder = writable_folder(folder)
-        self.no_figures = no_figures
-        self.as_json = as_json
-        self.rows: list[Any] = []
-        self.files: list[Path] = []
-        self.interrupted = False
         self.error: DecoupleError | None = None
 
     @contextmanager
@@ -222,19 +211,9 @@ class _Study:
         except DecoupleError as error:
             self.error = error
 
-    def keep_motion(self, case: Case, law: str, motion: xr.Dataset) -> None:
-        from ssm_decouple.files import writable_folder
-        from ssm_decouple.simulation.motion import save_motion
-
-        place = writable_folder(self.folder / case.name)
-        self.files.append(save_motion(motion, place / f"{self.name}_{file_name(law)}.nc"))
-
     def draw(self, name: str, figure: Callable[[Any], Figure], subject: Any) -> None:
-        if self.rows and not self.no_figures:
-            from ssm_decouple.viewing.style import save
-
-            place = self.folder / name
-            self.files += save(figure(subject), place.parent, place.name)
+        if self.rows:
+            self.draw_sheet(name, figure, subject)
 
     def report(self, tables: Mapping[str, Sequence[Sequence[str]]]) -> None:
         """Write the rows, print the tables and where the files are; leave with the interrupted status if it was."""
@@ -244,9 +223,7 @@ class _Study:
         if self.rows:
             self.files.insert(0, write_csv(self.rows, self.folder / f"{self.name}.csv"))
         if self.as_json:
-            rows = [dataclasses.asdict(row) for row in self.rows]
-            found = {"interrupted": self.interrupted, "rows": rows, "files": [str(path) for path in self.files]}
-            typer.echo(json.dumps(found, indent=2))
+            self.print_json()
         elif self.rows:
             for heading, lines in tables.items():
                 if len(lines) > 1:
