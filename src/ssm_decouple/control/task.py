@@ -93,10 +93,8 @@ class Task(ABC):
 
 
 @dataclass(frozen=True)
-class PositionTask(Task):
-    """Bring the origin of a frame to a position: target (3,), m, inertial axes; its velocity (3,), m/s.
-
-    The error is target minus position.
+class FrameTask(Task):
+    """What the tasks share that move a frame and need nothing else.
 
     Attributes:
         frame: Any frame of the robot; None for the end-effector.
@@ -106,6 +104,16 @@ class PositionTask(Task):
     gain: float | None = None
     weight: float = 1.0
     level: int = 1
+
+
+class PositionTask(FrameTask):
+    """Bring the origin of a frame to a position: target (3,), m, inertial axes; its velocity (3,), m/s.
+
+    The error is target minus position.
+
+    Attributes:
+        frame: Any frame of the robot; None for the end-effector.
+    """
 
     def pieces(self, robot: Robot) -> list[Piece]:
         """Return its three rows."""
@@ -121,8 +129,7 @@ class PositionTask(Task):
         return 3, 3
 
 
-@dataclass(frozen=True)
-class OrientationTask(Task):
+class OrientationTask(FrameTask):
     """Turn a frame to an attitude: target a rotation matrix (3, 3), frame to inertial axes, or a pin.SE3's.
 
     The error is the rotation vector of R_target R^T (3,), rad, inertial axes: the shortest turn to the target. The
@@ -131,11 +138,6 @@ class OrientationTask(Task):
     Attributes:
         frame: Any frame of the robot; None for the end-effector.
     """
-
-    frame: str | None = None
-    gain: float | None = None
-    weight: float = 1.0
-    level: int = 1
 
     def pieces(self, robot: Robot) -> list[Piece]:
         """Return its three rows."""
@@ -157,8 +159,7 @@ class OrientationTask(Task):
         return 9, 3
 
 
-@dataclass(frozen=True)
-class PoseTask(Task):
+class PoseTask(FrameTask):
     """Bring a frame to a pose: target a pin.SE3 or a homogeneous matrix (4, 4), frame to inertial.
 
     It is a position and an orientation task in one: the error (6,) is [position; rotation vector], m and rad, inertial
@@ -170,11 +171,6 @@ class PoseTask(Task):
     Attributes:
         frame: Any frame of the robot; None for the end-effector.
     """
-
-    frame: str | None = None
-    gain: float | None = None
-    weight: float = 1.0
-    level: int = 1
 
     def pieces(self, robot: Robot) -> list[Piece]:
         """Return three rows of position and three of rotation."""
