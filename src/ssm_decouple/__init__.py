@@ -19,11 +19,15 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ssm_decouple.control.law import Command as Command
     from ssm_decouple.control.law import SelectiveLaw as SelectiveLaw
+    from ssm_decouple.control.schedule import Schedule as Schedule
+    from ssm_decouple.control.schedule import ScheduledLaw as ScheduledLaw
     from ssm_decouple.control.task import BoresightTask as BoresightTask
+    from ssm_decouple.control.task import ManipulabilityTask as ManipulabilityTask
     from ssm_decouple.control.task import OrientationTask as OrientationTask
     from ssm_decouple.control.task import PoseTask as PoseTask
     from ssm_decouple.control.task import PositionTask as PositionTask
     from ssm_decouple.control.task import PostureTask as PostureTask
+    from ssm_decouple.control.task import RelativePoseTask as RelativePoseTask
     from ssm_decouple.errors import DecoupleError as DecoupleError
     from ssm_decouple.errors import DecoupleWarning as DecoupleWarning
     from ssm_decouple.errors import FileError as FileError
@@ -79,6 +83,7 @@ _HOME = {
     "FileError": "errors",
     "InputError": "errors",
     "Load": "simulation.dynamic",
+    "ManipulabilityTask": "control.task",
     "ModelError": "errors",
     "Modes": "model.appendage",
     "OrientationTask": "control.task",
@@ -87,8 +92,11 @@ _HOME = {
     "PositionTask": "control.task",
     "PostureTask": "control.task",
     "Protection": "momentum.protection",
+    "RelativePoseTask": "control.task",
     "Report": "model.report",
     "Robot": "model.robot",
+    "Schedule": "control.schedule",
+    "ScheduledLaw": "control.schedule",
     "SelectiveLaw": "control.law",
     "Sensors": "simulation.dynamic",
     "Servo": "simulation.dynamic",

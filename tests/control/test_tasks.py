@@ -79,7 +79,8 @@ def task_jacobian(law: SelectiveLaw, q: np.ndarray, target) -> np.ndarray:
     kernel.read_joints(q, constants[2])
     matrices, rates = np.zeros((kernel.J_TASK + law.layout.size, law.robot.n_joints)), np.zeros(law.layout.size)
     targets, velocities = law.layout.flat_targets(target), law.layout.flat_velocities(None)
-    assert kernel.add_matrices(*fixed, targets, velocities, 1.0, matrices, rates, np.zeros(law.size)) == kernel.OK
+    drift, out = np.zeros((len(matrices), 1)), np.zeros(law.size)
+    assert kernel.add_matrices(*fixed, targets, velocities, 1.0, matrices, drift, rates, out) == kernel.OK
     return matrices[kernel.J_TASK :]
 
 

@@ -85,8 +85,8 @@ def test_what_is_no_protection_is_refused(axes, says):
 
 
 def test_an_unknown_frame_is_refused():
-    with pytest.raises(ssm.InputError, match="frame is 'base' or 'inertial', not 'world'"):
-        Protection("yaw", frame="world")
+    with pytest.raises(ssm.InputError, match="frame is 'base', 'inertial' or the name of a frame of the robot, not ''"):
+        Protection("yaw", frame="")
 
 
 def test_parsing_one_word():

@@ -246,7 +246,7 @@ def test_everything_a_case_can_say(write, tmp_path):
         (('axes = "yaw"', "axes = [[1, 0, 0], [0, 1]]"), "each direction needs 3 numbers"),
         (('axes = "yaw"', "axes = [[1, 0, 0], 1]"), "each direction needs 3 numbers"),
         (('axes = "yaw"', "axes = [[1, 0, 0], [0, 1, 0, 0, 0, 0]]"), "each direction needs 3 numbers, or each 6"),
-        (('axes = "yaw"', 'axes = "yaw"\nframe = "body"'), "frame is 'base' or 'inertial'"),
+        (('axes = "yaw"', 'axes = "yaw"\nframe = ""'), "frame is 'base', 'inertial' or the name"),
         (("[target]", "law = 3\n[target]"), r"'law' must be a table: write \[law\]"),
         (("[target]", "[start]\njoints = [0]\njoints_deg = [0]\n[target]"), "tables by joint name that share none"),
         (("[target]", "[law]\nrate_limit = 1\nrate_limit_deg = 1\n[target]"), "not both"),

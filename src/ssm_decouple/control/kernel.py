@@ -73,7 +73,7 @@ THRESHOLD = 0
 DAMPING_LIMIT = 1
 MASS = 2
 LIMITS_STEPS = 3  # 1.0 if RATE_STEP limits anything
-INERTIAL = 4  # 1.0 if U_c is fixed in inertial axes, 0.0 in base axes
+AXES_JOINT = 4  # the joint in whose axes U_c is fixed: 0 for inertial axes, -1 for base axes
 TOOL_JOINT = 5  # the joint that holds the end-effector
 TOOL = 6  # 3: the end-effector in its joint's frame
 TASK_ROWS = 9  # of all tasks together
@@ -81,8 +81,9 @@ LEVELS = 10
 TARGET_SIZE = 11  # length of the targets of all tasks
 VELOCITY_SIZE = 12  # and of their velocities
 PACE = 13  # in [0, 1]
-WANTED_RATE = 14  # 6, the first k used: b, what J_sub q_dot shall be
-PARAMETERS_SIZE = 20
+WANTED_RATE = 14  # 6, the first k used: b, what the protected rate shall be
+MOMENTUM = 20  # 6: linear, and angular about the centre of mass, inertial axes
+PARAMETERS_SIZE = 26
 
 # Where a task's numbers stand in its row of `tasks`; the tasks stand in the order of their levels.
 KIND = 0
@@ -96,13 +97,17 @@ STRIDE = 7  # from row to row of a target that is a matrix
 VELOCITY = 8  # where its velocity begins
 POINT = 9  # 3: the frame's origin in its joint's frame
 AXES = 12  # 9: the frame's axes there, by rows; a boresight's third is the direction
-TASK_SIZE = 21
+REFERENCE = 21  # the joint that holds the frame in which the target stands; -1 for inertial axes
+REFERENCE_POINT = 22  # 3: that frame's origin in its joint's frame
+REFERENCE_AXES = 25  # 9: its axes there, by rows
+TASK_SIZE = 34
 
 # Kinds of tasks.
 POINTS = 0  # position of the frame's origin
 TURNS = 1  # rotation of the frame
 LOOKS = 2  # direction of the frame's third axis
 JOINTS = 3  # joint positions
+CLIMBS = 4  # joint rates, given as velocities
 
 # The rows of `columns`: one entry a joint.
 RATE_LIMIT = 0
@@ -110,11 +115,14 @@ RATE_STEP = 1  # largest change of the rate from one command to the next; infini
 PLACE = 2  # where the joint stands in q
 CONTINUOUS = 3  # 1.0 if it stands there as cosine and sine
 JOINT_POSITION = 4  # filled only where a task needs it
-MOVES = 5  # a row a task: 1.0 where the joint carries its frame, else 0.0; or which of its rows, from 1, the joint is
+SCALE = 5  # 1 / sqrt(w) of the joint's weight w in the norm of the rates
+# A row a task: 1.0 where the joint carries its frame, -1.0 where its reference, 0.0 where neither or both; or which of
+# its rows, from 1, the joint is.
+MOVES = 6
 
 # The rows of `matrices`, one column a joint.
 J_BASE = 0  # 6: base twist per joint rate, base axes
-J_PROTECTED = 6  # 6: base twist per joint rate, inertial axes; filled only where U_c is fixed in these
+J_PROTECTED = 6  # 6: base twist per joint rate, axes in which U_c is fixed; filled only where these are not base axes
 J_TASK = 12  # a row a task row: its generalized Jacobian, inertial axes, times the root of its weight
 
 EPS = 2.220446049250313e-16
@@ -205,6 +213,36 @@ def add_turning(J: Floats, J_base: Floats, moves: Floats, weight: float, B: Floa
             z += J[5, b] * J_base[b, j]
         for r in range(rows):
             J_task[r, j] += weight * (B[0, r] * x + B[1, r] * y + B[2, r] * z)
+
+
+@inlined
+def add_relative(J: Floats, p: Floats, moves: Floats, weight: float, R: Floats, turning: bool, J_task: Floats) -> None:
+    """Add to J_task (3, n) a weight times the relative motion per joint rate, in the axes R (3, 3) of the reference.
+
+    That of the point p of a frame as seen from another frame, or of the frame's rotation. The base has no part in it.
+    """
+    for j in range(J_task.shape[1]):
+        c, m = 6 + j, weight * moves[j]
+        if turning:
+            x, y, z = m * J[3, c], m * J[4, c], m * J[5, c]
+        else:
+            x = m * (J[0, c] + J[4, c] * p[2] - J[5, c] * p[1])
+            y = m * (J[1, c] + J[5, c] * p[0] - J[3, c] * p[2])
+            z = m * (J[2, c] + J[3, c] * p[1] - J[4, c] * p[0])
+        for r in range(3):
+            J_task[r, j] += R[0, r] * x + R[1, r] * y + R[2, r] * z
+
+
+@inlined
+def place_frame(held: Floats, task: Floats, first: int, p: Floats, B: Floats) -> None:
+    """Fill origin p (3,) and axes B (3, 3), inertial, of the frame that stands in the task's row from `first` on."""
+    for r in range(3):
+        p[r] = held[9 + r]
+        for c in range(3):
+            p[r] += held[3 * c + r] * task[first + c]
+            B[r, c] = 0.0
+            for b in range(3):
+                B[r, c] += held[3 * b + r] * task[first + 3 + 3 * b + c]
 
 
 @compiled
@@ -389,7 +427,7 @@ def bring_within_limits(fixed: Floats, q_dot: Floats, columns: Floats, pace: flo
 def add_joints(
     target: Floats, start: int, columns: Floats, moves: Floats, weight: float, root: float, J: Floats, error: Floats
 ) -> None:
-    """Add a posture task's rows to J (rows, n) and to its error; a continuous joint takes the shorter way."""
+    """Add the rows of joints to J (rows, n) and to their error; a continuous joint takes the shorter way."""
     for j in range(moves.shape[0]):
         row = int(moves[j]) - 1
         if row >= 0:
@@ -425,42 +463,56 @@ def add_tasks(
     for i in range(tasks.shape[0]):
         task, moves = tasks[i], columns[MOVES + i]
         kind, rows, start = int(task[KIND]), int(task[ROWS]), int(task[TARGET])
-        J_rows, error, held = J_task[row : row + rows], errors[row : row + rows], placements[int(task[JOINT])]
+        root, reference = weight * task[ROOT_WEIGHT], int(task[REFERENCE])
+        J_rows, error = J_task[row : row + rows], errors[row : row + rows]
         row += rows
-        if kind == POINTS:
-            for r in range(3):
-                p[r] = held[9 + r]
-                for c in range(3):
-                    p[r] += held[3 * c + r] * task[POINT + c]
-                error[r] -= weight * p[r]
-            add_point(J, p, J_base, moves, weight * task[ROOT_WEIGHT], base, J_rows)
-        elif kind == JOINTS:
+        if kind == CLIMBS:
+            for j in range(moves.shape[0]):
+                if moves[j] > 0.0:
+                    J_rows[int(moves[j]) - 1, j] += root
+            continue
+        if kind == JOINTS:
             add_joints(targets, start, columns, moves, weight, task[ROOT_WEIGHT], J_rows, error)
-        else:
-            for r in range(3):
-                for c in range(3):
-                    B[r, c] = 0.0
-                    for b in range(3):
-                        B[r, c] += held[3 * b + r] * task[AXES + 3 * b + c]
-            if kind == LOOKS:
-                right, velocity = turn_towards(targets[start : start + 3], B, e), int(task[VELOCITY])
-                for r in range(rows):
-                    for c in range(3):
-                        rates[row - rows + r] += weight * B[c, r] * velocities[velocity + c]
-            else:
-                right = turn_from(targets, start, int(task[STRIDE]), B, E, e)
+            continue
+        place_frame(placements[int(task[JOINT])], task, POINT, p, B)
+        if reference >= 0:
+            place_frame(placements[reference], task, REFERENCE_POINT, e, E)
+            add_relative(J, p, moves, root, E, kind == TURNS, J_rows)
+            if kind == POINTS:
                 for r in range(3):
                     for c in range(3):
-                        B[r, c] = 1.0 if r == c else 0.0
-            if not right:
-                status = NOT_A_TARGET
+                        error[r] -= weight * E[c, r] * (p[c] - e[c])
+                continue
+            for c in range(3):
+                for r in range(3):
+                    e[r] = E[0, r] * B[0, c] + E[1, r] * B[1, c] + E[2, r] * B[2, c]
+                for r in range(3):
+                    B[r, c] = e[r]
+        elif kind == POINTS:
+            for r in range(3):
+                error[r] -= weight * p[r]
+            add_point(J, p, J_base, moves, root, base, J_rows)
+            continue
+        if kind == LOOKS:
+            right, velocity = turn_towards(targets[start : start + 3], B, e), int(task[VELOCITY])
             for r in range(rows):
-                error[r] += weight * e[r]
-            add_turning(J, J_base, moves, weight * task[ROOT_WEIGHT], B, rows, J_rows)
+                for c in range(3):
+                    rates[row - rows + r] += weight * B[c, r] * velocities[velocity + c]
+        else:
+            right = turn_from(targets, start, int(task[STRIDE]), B, E, e)
+            for r in range(3):
+                for c in range(3):
+                    B[r, c] = 1.0 if r == c else 0.0
+        if not right:
+            status = NOT_A_TARGET
+        for r in range(rows):
+            error[r] += weight * e[r]
+        if reference < 0:
+            add_turning(J, J_base, moves, root, B, rows, J_rows)
     return status
 
 
-@inlined
+@compiled
 def add_matrices_at(
     A_g: Floats,
     J: Floats,
@@ -498,15 +550,67 @@ def add_matrices_at(
     for j in range(n):
         for b in range(6):
             matrices[J_BASE + b, j] += weight * J_base[b, j]
-    if parameters[INERTIAL] > 0.0:
+    if parameters[AXES_JOINT] >= 0.0:
+        axes, C = placements[int(parameters[AXES_JOINT])], small[0:3]
+        for r in range(3):
+            for c in range(3):  # m R is the upper left block of A_g
+                C[r, c] = (axes[3 * r] * A_g[0, c] + axes[3 * r + 1] * A_g[1, c] + axes[3 * r + 2] * A_g[2, c]) / mass
         for j in range(n):
             for b in range(0, 6, 3):
-                x, y, z = J_base[b, j], J_base[b + 1, j], J_base[b + 2, j]
                 for r in range(3):
-                    turned = (A_g[r, 0] * x + A_g[r, 1] * y + A_g[r, 2] * z) / mass
+                    turned = C[r, 0] * J_base[b, j] + C[r, 1] * J_base[b + 1, j] + C[r, 2] * J_base[b + 2, j]
                     matrices[J_PROTECTED + b + r, j] += weight * turned
     J_task = matrices[J_TASK:]
     return add_tasks(J, placements, J_base, tasks, columns, targets, velocities, weight, J_task, errors, rates, small)
+
+
+@compiled
+def add_drift(
+    A_g: Floats,
+    J: Floats,
+    placements: Floats,
+    tasks: Floats,
+    columns: Floats,
+    parameters: Floats,
+    targets: Floats,
+    velocities: Floats,
+    weight: float,
+    drift: Floats,
+) -> None:
+    """Add to drift (J_TASK + m, 1), a weight times, what the momentum moves while the joints stand still.
+
+    The rows are those of `matrices`. It is the column of a joint that carries nothing and turns at unit rate, whose
+    momentum is that on board with the other sign.
+    """
+    moving = False
+    for i in range(6):
+        moving = moving or parameters[MOMENTUM + i] != 0.0
+    if not moving:
+        return
+    m = int(parameters[TASK_ROWS])
+    A, J_one = np.zeros((7, 6)).T, np.zeros((7, 6)).T
+    for r in range(6):
+        A[r, 6] = -parameters[MOMENTUM + r]
+        for c in range(6):
+            A[r, c], J_one[r, c] = A_g[r, c], J[r, c]
+    place, errors, rates = np.zeros(3), np.zeros(m), np.zeros(m)
+    add_matrices_at(
+        A,
+        J_one,
+        placements,
+        tasks,
+        np.zeros((MOVES + tasks.shape[0], 1)),
+        parameters,
+        targets,
+        velocities,
+        weight,
+        drift,
+        place,
+        errors,
+        rates,
+        np.empty((6, 1)),
+        np.empty((11, 6)),
+    )
 
 
 @inlined
@@ -608,12 +712,14 @@ def take_out_leak(
     order: Floats,
     rank: int,
     wanted: Floats,
+    scale: Floats,
     leak: Floats,
     x: Floats,
 ) -> None:
     """Bring x (n,) to J_sub x = wanted in place, x -= J_sub^+ (J_sub x - wanted), by what factored J_sub.
 
-    From x = 0 this is the solution of minimum norm. Only the first `rank` rows in order are looked at.
+    The columns of J_sub were factored times `scale` (n,): from x = 0 this is the solution of minimum norm of x / scale.
+    Only the first `rank` rows in order are looked at.
     """
     n = x.shape[0]
     leak[:] = 0.0
@@ -627,7 +733,7 @@ def take_out_leak(
     for i in range(rank - 1, -1, -1):
         apply_reflection(rows, weights, i, i, leak)
     for j in range(n):
-        x[j] -= leak[j]
+        x[j] -= scale[j] * leak[j]
 
 
 @compiled
@@ -683,7 +789,7 @@ def fixed_part(
     if rank < k:
         nearest_attainable(rows, diagonal, order, k, rank, wanted)
     for _ in range(2):  # the second time takes out the rounding of the first
-        take_out_leak(J_sub, rows, weights, diagonal, order, rank, wanted, leak, q_dot)
+        take_out_leak(J_sub, rows, weights, diagonal, order, rank, wanted, columns[SCALE], leak, q_dot)
     leak[:] = 0.0
     factor = bring_within_limits(leak, q_dot, columns, 1.0)
     for i in range(k):
@@ -716,10 +822,14 @@ def meet_tasks(
     rates: Floats,
     results: Floats,
     fixed: Floats,
+    drift: Floats,
     asked: bool,
     v: Floats,
 ) -> None:
-    """Fill what the task rows shall do, v (m,), times the root of the weight, and complete the errors of positions."""
+    """Fill what the task rows shall do, v (m,), times the root of the weight, and complete the errors of positions.
+
+    What the fixed rates and the momentum on board do already is taken off.
+    """
     pace, row = parameters[PACE], 0
     for i in range(tasks.shape[0]):
         task = tasks[i]
@@ -730,15 +840,17 @@ def meet_tasks(
                 results[ERRORS + row] = targets[start + r * int(task[STRIDE])] + results[ERRORS + row]
             v[row] = task[ROOT_WEIGHT] * (pace * (wanted + task[GAIN] * results[ERRORS + row]))
             row += 1
-    if asked:
-        for r in range(v.shape[0]):
+    for r in range(v.shape[0]):
+        v[r] -= drift[J_TASK + r, 0]
+        if asked:
             for j in range(fixed.shape[0]):
                 v[r] -= matrices[J_TASK + r, j] * fixed[j]
 
 
-@inlined
+@compiled
 def solve(
     matrices: Floats,
+    drift: Floats,
     U_c: Floats,
     tasks: Floats,
     columns: Floats,
@@ -763,6 +875,9 @@ def solve(
     paper's objective. What is left moves neither, and there J_2 is lower triangular, and so on.
 
     Where J_sub q_dot = b is asked for, all that stands beside a fixed part J_sub^+ b, which the tasks take as given.
+    Momentum on board, which moves what `drift` (J_TASK + m, 1) says, asks for what takes this off.
+
+    Weights of the joints scale the columns before the factorisation and the rates after it.
     """
     n, k, m, pace = columns.shape[1], U_c.shape[1], matrices.shape[0] - J_TASK, parameters[PACE]
     results = out[6 + n :]
@@ -775,33 +890,37 @@ def solve(
     for i in range(k):
         order[i] = i
         wanted[i] = parameters[WANTED_RATE + i]
-        asked = asked or wanted[i] != 0.0
         if U_c[0, i] != 0.0 or U_c[1, i] != 0.0 or U_c[2, i] != 0.0:
             first = 0
 
-    source = J_PROTECTED if parameters[INERTIAL] > 0.0 else J_BASE
-    scale = 0.0
+    source = J_PROTECTED if parameters[AXES_JOINT] >= 0.0 else J_BASE
+    for i in range(k):
+        for b in range(first, 6):
+            wanted[i] -= U_c[b, i] * drift[source + b, 0]
+        asked = asked or wanted[i] != 0.0
+    square = 0.0
     for j in range(n):
+        scale = columns[SCALE, j]
         fixed[j], q_dot[j] = 0.0, 0.0
         for b in range(first, 6):
-            scale += matrices[source + b, j] ** 2
+            square += (scale * matrices[source + b, j]) ** 2
         for i in range(k):
             J_sub[i, j] = 0.0
             for b in range(first, 6):
                 J_sub[i, j] += U_c[b, i] * matrices[source + b, j]
-            rows[i, j] = J_sub[i, j]
+            rows[i, j] = scale * J_sub[i, j]
         for r in range(m):
-            rows[k + r, j] = matrices[J_TASK + r, j]
+            rows[k + r, j] = scale * matrices[J_TASK + r, j]
     # The matrices are sums about the inertial origin, so that their rounding grows with the distance from it.
     far = 1.0 + abs(results[POSITION]) + abs(results[POSITION + 1]) + abs(results[POSITION + 2])
-    rank = factor_protected_rows(rows, weights, diagonal, order, k, NOISE * far * np.sqrt(scale))
+    rank = factor_protected_rows(rows, weights, diagonal, order, k, NOISE * far * np.sqrt(square))
     if asked:
         fixed_part(J_sub, rows, weights, diagonal, order, rank, columns, wanted, leak, fixed)
-    meet_tasks(matrices, tasks, parameters, targets, velocities, rates, results, fixed, asked, v)
+    meet_tasks(matrices, tasks, parameters, targets, velocities, rates, results, fixed, drift, asked, v)
 
     levels, at, row, i = int(parameters[LEVELS]), rank, 0, 0
     for level in range(levels):
-        size, scale = 0, 0.0
+        size, square = 0, 0.0
         while i < tasks.shape[0] and int(tasks[i, LEVEL]) == level:
             size += int(tasks[i, ROWS])
             i += 1
@@ -809,8 +928,8 @@ def solve(
         if level < levels - 1:
             for r in range(row, row + size):
                 for j in range(n):
-                    scale += matrices[J_TASK + r, j] ** 2
-            noise = NOISE * far * np.sqrt(scale)
+                    square += (columns[SCALE, j] * matrices[J_TASK + r, j]) ** 2
+            noise = NOISE * far * np.sqrt(square)
         count = factor_level(rows, weights, starts, k + row, size, at, noise, L)
         for t in range(size):
             part[t] = v[row + t]
@@ -825,9 +944,8 @@ def solve(
             apply_reflection(rows, weights, k + t, int(starts[k + t]), q_dot)
     for i in range(rank - 1, -1, -1):
         apply_reflection(rows, weights, i, i, q_dot)
-    if asked:
-        for j in range(n):
-            q_dot[j] += fixed[j]
+    for j in range(n):
+        q_dot[j] = columns[SCALE, j] * q_dot[j] + fixed[j]
 
     rate_scale = bring_within_limits(fixed, q_dot, columns, pace)
     blend = 1.0
@@ -836,13 +954,13 @@ def solve(
         # between the two. From rest, with b = 0, this is time scaling.
         for j in range(n):
             slow[j] = previous[j]
-        take_out_leak(J_sub, rows, weights, diagonal, order, rank, wanted, leak, slow)
+        take_out_leak(J_sub, rows, weights, diagonal, order, rank, wanted, columns[SCALE], leak, slow)
         bring_within_limits(fixed, slow, columns, pace)
         blend = largest_blend(slow, q_dot, previous, columns)
         for j in range(n):
             q_dot[j] = slow[j] + blend * (q_dot[j] - slow[j])
     if rank > 0:  # what rounding has left in the protected rows
-        take_out_leak(J_sub, rows, weights, diagonal, order, rank, wanted, leak, q_dot)
+        take_out_leak(J_sub, rows, weights, diagonal, order, rank, wanted, columns[SCALE], leak, q_dot)
         # Where J_sub is ill-conditioned the correction can lift a rate above its limit by more than rounding.
         rate_scale *= bring_within_limits(fixed, q_dot, columns, pace)
 
@@ -853,12 +971,14 @@ def solve(
         out[6 + j] = q_dot[j]
         total += q_dot[j]
     for b in range(6):
-        out[b] = 0.0
+        out[b] = drift[J_BASE + b, 0]
         for j in range(n):
             out[b] += matrices[J_BASE + b, j] * q_dot[j]
     for i in range(6):
         results[PROTECTED_RATE + i] = 0.0
         if i < k:
+            for b in range(first, 6):
+                results[PROTECTED_RATE + i] += U_c[b, i] * drift[source + b, 0]
             for j in range(n):
                 results[PROTECTED_RATE + i] += J_sub[i, j] * q_dot[j]
     results[RATE_SCALE] = rate_scale
@@ -916,6 +1036,7 @@ def selective_command(
         return WRONG_SIZE
     # Two allocations for all scratch: each costs as much as a reflection.
     work, small = np.empty((J_TASK + 22 + 2 * m, n)), np.empty((max(2 * m + 7, 11) + 1, 6 + m))
+    drift = np.zeros((J_TASK + m, 1))
     matrices, J_base, scratch = work[: J_TASK + m], work[J_TASK + m : J_TASK + m + 6], work[J_TASK + m + 6 :]
     results = out[6 + n :]
     position, errors = results[POSITION : POSITION + 3], results[ERRORS : ERRORS + m]
@@ -943,7 +1064,10 @@ def selective_command(
     )
     if status != OK:
         return status
-    return solve(matrices, U_c, tasks, columns, parameters, targets, velocities, previous, out, rates, scratch, small)
+    add_drift(A_g, J, placements, tasks, columns, parameters, targets, velocities, 1.0, drift)
+    return solve(
+        matrices, drift, U_c, tasks, columns, parameters, targets, velocities, previous, out, rates, scratch, small
+    )
 
 
 @compiled
@@ -959,16 +1083,18 @@ def add_matrices(
     velocities: Floats,
     weight: float,
     matrices: Floats,
+    drift: Floats,
     rates: Floats,
     out: Floats,
 ) -> int:
-    """Add one configuration's matrices (J_TASK + m, n) and rates (m,), and what stands in `out`, times a weight.
+    """Add one configuration's matrices (J_TASK + m, n), drift (J_TASK + m, 1), rates (m,) and what `out` has, weighted.
 
     With m task rows; in `out` position and errors. The other arguments and the value returned are those of
     `selective_command`, the sizes of targets and velocities as `parameters` says.
     """
     n, m = columns.shape[1], int(parameters[TASK_ROWS])
     J_base, small, results = np.empty((6, n)), np.empty((11, 6)), out[6 + n :]
+    add_drift(A_g, J, placements, tasks, columns, parameters, targets, velocities, weight, drift)
     return add_matrices_at(
         A_g,
         J,
@@ -996,6 +1122,8 @@ def advance_targets(tasks: Floats, targets: Floats, velocities: Floats, time: fl
     for i in range(tasks.shape[0]):
         kind, rows = int(tasks[i, KIND]), int(tasks[i, ROWS])
         start, stride, velocity = int(tasks[i, TARGET]), int(tasks[i, STRIDE]), int(tasks[i, VELOCITY])
+        if kind == CLIMBS:
+            continue
         if kind in (POINTS, JOINTS):
             for r in range(rows):
                 later[start + r * stride] = targets[start + r * stride] + time * velocities[velocity + r]
@@ -1048,6 +1176,7 @@ def change_of(rates: Floats, before: Floats) -> float:
 @compiled
 def held_command(
     matrices: Floats,
+    drift: Floats,
     U_c: Floats,
     tasks: Floats,
     columns: Floats,
@@ -1066,4 +1195,6 @@ def held_command(
     if wrong_size(n, parameters, targets, velocities, previous, out):
         return WRONG_SIZE
     scratch, small = np.empty((16 + m, n)), np.empty((max(2 * m + 7, 11) + 1, 6 + m))
-    return solve(matrices, U_c, tasks, columns, parameters, targets, velocities, previous, out, rates, scratch, small)
+    return solve(
+        matrices, drift, U_c, tasks, columns, parameters, targets, velocities, previous, out, rates, scratch, small
+    )

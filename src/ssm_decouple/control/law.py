@@ -29,6 +29,9 @@ GAUSS: dict[int, tuple[tuple[float, float], ...]] = {
 # One look-up instead of two, in every step.
 centroidal_map, selective_command = pin.computeCentroidalMap, kernel.selective_command
 
+CLIMB_STEP = 1e-6  # rad or m, of the finite differences
+CLIMB_SHARE = 0.25  # of the rate limits
+
 PASSES = 12  # at most; away from singularities each gains a factor of about sample time x joint rate
 CONVERGED = 1e-13  # relative change of the rates from pass to pass
 
@@ -204,12 +207,21 @@ class SelectiveLaw:
     1, each times the root of its task's weight, stands for J_gt. A second level acts in what the protection and J_1
     leave, and so on; no level disturbs those before it. rho is found for each level.
 
+    Momentum on board, such as what a push or spinning wheels have left, moves the base even while the joints stand
+    still. The law takes that off what it asks of the joints: the protected rate stays zero as long as the joints can
+    take the momentum up, and the tasks are met beside it.
+
     A law holds Pinocchio's scratch memory: use one law in one thread.
 
     Args:
         robot: The robot.
         protection: The directions about which the base must not turn.
         tasks: What the arm shall do: one task or several; None is the end-effector's position, `PositionTask()`.
+        joint_weights: w of the joints (n,) in the norm sum w_j q_dot_j^2 that the rates minimise, and that damping
+            and its threshold act in. None is 1 for all but reaction wheels, which have (r / max_speed)^2, r being the
+            largest rate limit of the other joints: a wheel's full speed counts as much as theirs.
+        momentum: On board (6,), [linear; angular about the centre of mass], kg m/s and kg m2/s, inertial axes; None
+            for none. It may be assigned later as `law.momentum`, for example when thrusters have changed it.
         gain: Tracking gain k_p, 1/s, of the tasks that name none.
         rate_limit: Largest joint rates, rad/s or m/s: one number, an array (n,), or None for the URDF's.
         damping: rho at a singularity, m2; 0 gives the Moore-Penrose inverse everywhere.
@@ -223,6 +235,7 @@ class SelectiveLaw:
 
     Attributes:
         size: Length of the array that `evaluate` fills.
+        joint_weights: (n,), as given or by default.
         tasks: The tasks, a tuple.
         layout: Where their rows and targets stand.
 
@@ -243,6 +256,8 @@ class SelectiveLaw:
         hold_nodes: int = 0,
         acceleration_limit: ArrayLike | None = None,
         tasks: Task | Sequence[Task] | None = None,
+        joint_weights: ArrayLike | None = None,
+        momentum: ArrayLike | None = None,
     ) -> None:
         n = robot.n_joints
         if n == 0:
@@ -266,12 +281,53 @@ class SelectiveLaw:
         self.acceleration_limits: Floats | None = None
         if acceleration_limit is not None:
             self.acceleration_limits = _limits(robot, "acceleration_limit", acceleration_limit)
+        self.joint_weights: Floats = (
+            _default_weights(robot, self.rate_limits)
+            if joint_weights is None
+            else _per_joint(robot, "joint_weights", joint_weights, "finite")
+        )
         self.tasks = (PositionTask(),) if tasks is None else checked_tasks(robot, tasks)
         self.layout = Layout(robot, self.tasks, self.gain)
         self.size: int = 6 + n + kernel.ERRORS + self.layout.size + 2 * len(self.layout.level_rows)
         self._prepare()
+        self._set_momentum(momentum)
         if tasks is not None:
             self._refuse_what_nothing_is_left_for()
+
+    @property
+    def directions(self) -> tuple[Floats, str]:
+        """The protected directions of the base twist, columns (6, k), and the axes in which they are fixed."""
+        return self.protection.U_twist, self.protection.frame
+
+    def shares(self, time: Floats, configurations: Floats) -> Floats | None:
+        """Return how far each of `directions` is protected (m, k), 0 to 1; None where that never changes.
+
+        Args:
+            time: Sample times (m,), s.
+            configurations: (m, nq).
+        """
+        return None
+
+    @property
+    def momentum(self) -> Floats:
+        """Momentum on board (6,): [linear; angular about the centre of mass], kg m/s and kg m2/s, inertial axes."""
+        return self._momentum()
+
+    @momentum.setter
+    def momentum(self, momentum: ArrayLike | None) -> None:
+        self._set_momentum(momentum)
+
+    def _momentum(self) -> Floats:
+        return self._prepared[3][3][kernel.MOMENTUM :].copy()
+
+    def _set_momentum(self, momentum: ArrayLike | None) -> None:
+        values = np.zeros(6) if momentum is None else as_floats("momentum", momentum)
+        if values.shape != (6,) or not np.all(np.isfinite(values)):
+            raise InputError(
+                f"momentum is {values.tolist()}; it needs 6 finite numbers, linear and angular about the centre of "
+                "mass, inertial axes"
+            )
+        self._prepared[3][3][kernel.MOMENTUM :] = values
 
     def _refuse_what_nothing_is_left_for(self) -> None:
         """Count freedoms where the arm stands nowhere special."""
@@ -301,9 +357,27 @@ class SelectiveLaw:
         model, data, _, _, fixed = self._prepared
         targets, velocities = np.zeros(self.layout.target_sizes[0]), self._at_rest
         pin.computeCentroidalMap(model, data, q)
-        matrices, rates, out = np.zeros_like(self._matrices), np.zeros(self.layout.size), np.zeros(self.size)
-        kernel.add_matrices(*fixed, targets, velocities, 1.0, matrices, rates, out)
+        matrices, drift, rates = np.zeros_like(self._matrices), np.zeros_like(self._drift), np.zeros(self.layout.size)
+        kernel.add_matrices(*fixed, targets, velocities, 1.0, matrices, drift, rates, np.zeros(self.size))
         return matrices[kernel.J_TASK :]
+
+    def _rates_that_climb(self, q: ArrayLike, gain: float) -> Floats:
+        """Return gain times the gradient of log w (n,), w the manipulability of level 1, by finite differences."""
+        model, start = self.robot.model, self.robot.checked(q)
+        rows = self.layout.level_rows[0]
+
+        def log_volume(at: Floats) -> float:
+            J = self._task_jacobian(at)[rows] @ self.protection.null_space_basis(self.robot.coupling(at))
+            return 0.5 * float(np.linalg.slogdet(J @ J.T)[1])
+
+        here, turn, slopes = log_volume(start), np.zeros(model.nv), np.zeros(self._n)
+        for j in range(self._n):
+            turn[:] = 0.0
+            turn[6 + j] = CLIMB_STEP
+            slopes[j] = gain * (log_volume(pin.integrate(model, start, turn)) - here) / CLIMB_STEP
+        if not np.all(np.isfinite(slopes)):  # at a singularity all ways lead up
+            return np.zeros(self._n)
+        return slopes / max(1.0, float(np.max(np.abs(slopes) / (CLIMB_SHARE * self.rate_limits))))
 
     def _prepare(self) -> None:
         """Lay out what the kernel reads: views of Pinocchio's data and constant arrays."""
@@ -312,18 +386,19 @@ class SelectiveLaw:
         steps = np.full(n, np.inf)
         if self.acceleration_limits is not None and self.sample_time is not None:
             steps = self.acceleration_limits * self.sample_time
-        inertial = self.protection.frame == "inertial"
-        scalars = [self.damping_threshold, self.damping, robot.mass, float(limited), float(inertial)]
+        axes_joint, U_c = self._protected_axes()
+        scalars = [self.damping_threshold, self.damping, robot.mass, float(limited), axes_joint]
         tool = [frame.parentJoint, *frame.placement.translation]
         counts = [layout.size, len(layout.level_rows), *layout.target_sizes]
-        parameters = np.array([*scalars, *tool, *counts, 1.0, *np.zeros(6)])
+        parameters = np.array([*scalars, *tool, *counts, 1.0, *np.zeros(12)])
         joints = list(model.joints)[2:]
         places, continuous = [float(joint.idx_q) for joint in joints], [float(joint.nq == 2) for joint in joints]
-        columns = np.vstack([self.rate_limits, steps, places, continuous, np.zeros(n), layout.moves])
+        scale = 1.0 / np.sqrt(self.joint_weights)
+        columns = np.vstack([self.rate_limits, steps, places, continuous, np.zeros(n), scale, layout.moves])
         data = model.createData()
         # Live views into the Pinocchio data, fetched once: each fetch would cost as much as a tenth of the step.
         views = (data.Ag, data.J, _placements(data, model.njoints))
-        constants = (self.protection.U_twist.copy(), layout.table, columns, parameters)
+        constants = (U_c, layout.table, columns, parameters)
         self._prepared = (model, data, views, constants, (*views, *constants))
         self._reads_joints = bool(np.any(layout.table[:, kernel.KIND] == kernel.JOINTS))
         self._flat = layout.plain
@@ -334,10 +409,21 @@ class SelectiveLaw:
         self._looks_at_q = self._reads_joints or self._circles is not None
         self._n, self._k = n, self.protection.k
         self._no_rates: Floats = np.zeros(n)
+        self._any_target: Floats = layout.any_target()
         self._J_base: Floats = np.zeros((6, n))
         self._matrices: Floats = np.zeros((kernel.J_TASK + layout.size, n))
+        self._drift: Floats = np.zeros((kernel.J_TASK + layout.size, 1))
         self._later: Floats = np.zeros(layout.target_sizes[0])
         self._rates: Floats = np.zeros(layout.size)
+
+    def _protected_axes(self) -> tuple[float, Floats]:
+        """Return the joint in whose axes the protected directions are fixed, by the kernel's numbers, and U_c there."""
+        robot, U_c = self.robot, self.protection.U_twist.copy()
+        if self.protection.frame in ("base", "inertial"):
+            return (-1.0 if self.protection.frame == "base" else 0.0), U_c
+        frame = robot.model.frames[robot.frame_id(self.protection.frame)]
+        R = frame.placement.rotation
+        return float(frame.parentJoint), np.vstack([R @ U_c[:3], R @ U_c[3:]])
 
     def __call__(
         self,
@@ -347,6 +433,7 @@ class SelectiveLaw:
         previous_rates: ArrayLike | None = None,
         protected_rate: ArrayLike | None = None,
         pace: float = 1.0,
+        time: float = 0.0,
     ) -> Command:
         """Return the command at a configuration.
 
@@ -357,13 +444,14 @@ class SelectiveLaw:
             target_velocity: Its velocity (3,), m/s, inertial axes, or those of the tasks likewise; None for at rest.
             previous_rates: The joint rates commanded before (n,), rad/s or m/s; needed with an acceleration limit,
                 zeros from rest.
-            protected_rate: b (k,), what J_sub q_dot shall be, rad/s, or m/s and rad/s; None for zero. The arm makes it
-                with the smallest rates J_sub^+ b; the task uses null(J_sub), and yields first at the rate limits. Where
-                J_sub^+ b alone exceeds them it is scaled to them as a whole, and where J_sub has not the rank for b,
+            protected_rate: b (k,), what the protected rate shall be, rad/s, or m/s and rad/s; None for zero. The arm
+                makes it with the smallest rates J_sub^+ b; the task uses null(J_sub), and yields first at the rate
+                limits. Where J_sub^+ b alone exceeds them it is scaled to them as a whole, and where J_sub has not the rank for b,
                 the nearest b that there is takes its place: the command's `protected_rate` tells.
             pace: In [0, 1], scales the time of the command but not b: gain, target velocity and rate limits times
                 pace, so that with b = 0 the command is pace times the plain one (damped as that is). Beside rates
                 J_sub^+ b the limits move from these, at pace 0, to the full ones, at pace 1.
+            time: s; only a `ScheduledLaw` looks at it.
 
         Returns:
             The command; its numbers are its own and stay as they are.
@@ -391,6 +479,7 @@ class SelectiveLaw:
         previous_rates: ArrayLike | None = None,
         protected_rate: ArrayLike | None = None,
         pace: float = 1.0,
+        time: float = 0.0,
     ) -> None:
         """Compute a command into an array: the same as calling the law, without the result object.
 
@@ -401,8 +490,9 @@ class SelectiveLaw:
             target_velocity: Its velocity (3,), m/s, inertial axes; of other tasks from `layout.flat_velocities`.
             out: Array (law.size,), overwritten: the velocity v (6 + n) and the results that `Command` names.
             previous_rates: The joint rates commanded before (n,).
-            protected_rate: b (k,), what J_sub q_dot shall be, as for the call.
+            protected_rate: b (k,), what the protected rate shall be, as for the call.
             pace: In [0, 1], as for the call.
+            time: s; only a `ScheduledLaw` looks at it.
 
         Raises:
             InputError: as for the call.
@@ -410,7 +500,7 @@ class SelectiveLaw:
         if protected_rate is not None or pace != 1.0:
             _, _, _, (*_, parameters), _ = self._prepared
             usual = parameters.copy()
-            parameters[kernel.PACE :] = self._asked(protected_rate, pace)
+            parameters[kernel.PACE : kernel.MOMENTUM] = self._asked(protected_rate, pace)
             try:
                 self.evaluate(q, target, target_velocity, out, previous_rates)
             finally:
@@ -420,6 +510,11 @@ class SelectiveLaw:
             if self.acceleration_limits is not None:
                 raise InputError("an acceleration limit needs previous_rates: those commanded before, zeros from rest")
             previous_rates = self._no_rates
+        if self.layout.climbs is not None:
+            place, gain = self.layout.climbs
+            velocities = self._flat_vectors(target, target_velocity)[1].copy()
+            velocities[place] = self._rates_that_climb(q, gain)
+            target_velocity = velocities
         model, data, _, constants, fixed = self._prepared
         try:  # arrays of the right kind are not looked at twice
             centroidal_map(model, data, q)
@@ -441,12 +536,44 @@ class SelectiveLaw:
         if status:
             self._refuse(q, target, target_velocity, previous_rates, out, status)
 
+    def project(self, q: ArrayLike, joint_rates: Floats, out: Floats, protected_rate: ArrayLike | None = None) -> None:
+        """Bring joint rates to what the protection allows, in the rows for velocity and protected rate of an array.
+
+        At the sample, or over the hold where the law plans for that: the nearest rates to the given ones, in the norm
+        of the joint weights, within the rate limits. The tasks have no part in it.
+
+        Args:
+            q: Configuration (nq,).
+            joint_rates: (n,), rad/s or m/s.
+            out: (law.size,); its velocity, protected rate, rank and plan change are overwritten.
+            protected_rate: b (k,), as for the call; None for zero.
+        """
+        _, _, _, (_, _, columns, parameters), _ = self._prepared
+        steps, usual, values = columns[kernel.RATE_STEP].copy(), parameters.copy(), np.empty(self.size)
+        # A blend of nothing with the given rates, in the kernel's words.
+        columns[kernel.RATE_STEP], parameters[kernel.LIMITS_STEPS] = 0.0, 1.0
+        parameters[kernel.PACE : kernel.MOMENTUM] = self._asked(protected_rate, 1.0)
+        targets = self._any_target
+        try:
+            self.evaluate(q, targets, self._at_rest, values, np.ascontiguousarray(joint_rates))
+        finally:
+            columns[kernel.RATE_STEP], parameters[:] = steps, usual
+        start = 6 + self._n
+        out[: start + kernel.POSITION] = values[: start + kernel.POSITION]
+        for kept in (kernel.RANK, kernel.PLAN_CHANGE):
+            out[start + kept] = values[start + kept]
+
     def base_twist(self, q: Floats, joint_rates: Floats) -> Floats:
-        """Return the base twist (6,), base axes, that joint rates (n,) cause at q; `Coupling.base_twist`, but quick."""
-        model, data, views, *_ = self._prepared
+        """Return the base twist (6,), base axes, that joint rates (n,) and the momentum on board cause at q.
+
+        Without momentum it is `Coupling.base_twist`, but quick.
+        """
+        model, data, (A_g, *_), (*_, parameters), _ = self._prepared
         pin.computeCentroidalMap(model, data, q)
-        kernel.base_twist_map(views[0], self._J_base)
-        return self._J_base @ joint_rates
+        kernel.base_twist_map(A_g, self._J_base)
+        twist = self._J_base @ joint_rates
+        momentum = parameters[kernel.MOMENTUM :]
+        return twist + np.linalg.solve(A_g[:, :6], momentum) if momentum.any() else twist
 
     def lost_direction(self, q: ArrayLike) -> LostDirection:
         """Return the direction that the tasks of level 1 can move in least at q, and which protected row takes it.
@@ -480,6 +607,7 @@ class SelectiveLaw:
         velocity, results = out[: model.nv], out[model.nv :]
         kernel.base_twist_map(views[0], self._J_base)  # at the sample, as is the base twist that the command tells
         errors = results[kernel.ERRORS :][: self.layout.size]
+        self._base_drift = out[:6] - self._J_base @ velocity[6:]
         kept_position, kept_errors = results[kernel.POSITION :][:3].copy(), errors.copy()
         kernel.advance_targets(tasks, target, target_velocity, 0.5 * float(self.sample_time or 0.0), self._later)
         status, change = self._plan(q, (columns, parameters), target_velocity, previous, out)
@@ -499,23 +627,24 @@ class SelectiveLaw:
     ) -> tuple[int, float]:
         """Iterate on mean matrices and command; return the status and the last relative change of the rates."""
         model, data, _, (U_c, tasks, columns, _), fixed = self._prepared
-        hold, matrices, rates, targets = float(self.sample_time or 0.0), self._matrices, self._rates, self._later
+        hold, matrices, drift, rates = float(self.sample_time or 0.0), self._matrices, self._drift, self._rates
+        targets = self._later
         velocity, results = out[: model.nv], out[model.nv :]
         position, errors = results[kernel.POSITION :][:3], results[kernel.ERRORS :][: self.layout.size]
         status, change, before = kernel.OK, np.inf, velocity[6:].copy()
         for _ in range(PASSES):
-            for total in (matrices, rates, position, errors):
+            for total in (matrices, drift, rates, position, errors):
                 total[:] = 0.0
             for node, weight in GAUSS[self.hold_nodes]:
                 moved = pin.integrate(model, q, node * hold * velocity)
                 pin.computeCentroidalMap(model, data, moved)
                 if self._reads_joints:
                     kernel.read_joints(moved, columns)
-                status = status or kernel.add_matrices(*fixed, targets, velocities, weight, matrices, rates, out)
+                status = status or kernel.add_matrices(*fixed, targets, velocities, weight, matrices, drift, rates, out)
             status = status or kernel.held_command(
-                matrices, U_c, tasks, *settings, targets, velocities, previous, rates, out
+                matrices, drift, U_c, tasks, *settings, targets, velocities, previous, rates, out
             )
-            velocity[:6] = self._J_base @ velocity[6:]
+            velocity[:6] = self._J_base @ velocity[6:] + self._base_drift
             change = kernel.change_of(velocity[6:], before)
             if status != kernel.OK or change <= CONVERGED:
                 break
@@ -534,7 +663,7 @@ class SelectiveLaw:
 
     def _asked(self, protected_rate: ArrayLike | None, pace: float) -> Floats:
         """Return pace and protected rate as they stand in the kernel's parameters."""
-        asked = np.zeros(kernel.PARAMETERS_SIZE - kernel.PACE)
+        asked = np.zeros(kernel.MOMENTUM - kernel.PACE)
         asked[0] = _finite("pace", pace)
         if not 0.0 <= asked[0] <= 1.0:
             raise InputError(f"pace is {pace}; it is between 0 (at rest) and 1 (full)")
@@ -588,6 +717,8 @@ class SelectiveLaw:
             "tasks": [task.describe() for task in self.tasks],
             "gain": self.gain,
             "rate_limits": self.rate_limits.tolist(),
+            "joint_weights": self.joint_weights.tolist(),
+            "momentum": self.momentum.tolist(),
             "damping": self.damping,
             "damping_threshold": self.damping_threshold,
             "sample_time": self.sample_time,
@@ -629,9 +760,21 @@ def _vector(name: str, value: ArrayLike) -> Floats:
 
 
 def _limits(robot: Robot, name: str, given: ArrayLike) -> Floats:
-    limits = as_floats(name, given)
-    if limits.shape not in ((), (robot.n_joints,)):
-        raise InputError(f"{name} has shape {limits.shape}; give one number or one for each of {robot.n_joints} joints")
-    if not np.all(limits > 0):
-        raise InputError(f"{name} is {given!r}; every joint's must be above zero (infinity for no limit)")
-    return np.broadcast_to(limits, (robot.n_joints,)).copy()
+    return _per_joint(robot, name, given, "infinity for no limit")
+
+
+def _per_joint(robot: Robot, name: str, given: ArrayLike, infinity: str) -> Floats:
+    values = as_floats(name, given)
+    if values.shape not in ((), (robot.n_joints,)):
+        raise InputError(f"{name} has shape {values.shape}; give one number or one for each of {robot.n_joints} joints")
+    if not np.all(values > 0) or (infinity == "finite" and not np.all(np.isfinite(values))):
+        raise InputError(f"{name} is {given!r}; every joint's must be above zero ({infinity})")
+    return np.broadcast_to(values, (robot.n_joints,)).copy()
+
+
+def _default_weights(robot: Robot, rate_limits: Floats) -> Floats:
+    weights, wheels = np.ones(robot.n_joints), [robot.joint_index(name) for name in robot.wheel_names]
+    others = np.delete(rate_limits, wheels)
+    if wheels and others.size and np.all(np.isfinite([*rate_limits[wheels], others.max()])):
+        weights[wheels] = (others.max() / rate_limits[wheels]) ** 2
+    return weights

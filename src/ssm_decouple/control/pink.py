@@ -66,9 +66,11 @@ class ProtectedRate(Task):  # type: ignore[misc]
         """Return the rows (k, nv) that take the protected components of the base twist out of v."""
         rows = np.zeros((self.protection.k, configuration.model.nv))
         U = self.protection.U_twist
-        if self.protection.frame == "inertial":
-            R = pin.Quaternion(np.array(configuration.q[3:7])).matrix()
-            U = np.vstack([R.T @ U[:3], R.T @ U[3:]])
+        if self.protection.frame != "base":
+            R = pin.Quaternion(np.array(configuration.q[3:7])).matrix().T
+            if self.protection.frame != "inertial":
+                R = R @ configuration.get_transform_frame_to_world(self.protection.frame).rotation
+            U = np.vstack([R @ U[:3], R @ U[3:]])
         rows[:, :6] = U.T
         return rows
 

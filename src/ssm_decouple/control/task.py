@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -34,6 +34,8 @@ class Piece(NamedTuple):
     target: int = 0  # where its part of the task's target begins
     stride: int = 1
     velocity: int = 0
+    reference: int = -1  # joint that holds the frame in which the target stands; -1 for inertial axes
+    reference_pose: pin.SE3 = pin.SE3.Identity()  # of that frame in its joint
 
 
 class Task(ABC):
@@ -43,11 +45,13 @@ class Task(ABC):
         gain: k_p, 1/s: the error falls as exp(-gain t) where nothing hinders it; None for the law's.
         weight: Of the task's squared error rate, beside the other tasks of its level.
         level: Its priority: 1 is the first after the protection.
+        takes_target: Whether it needs a target.
     """
 
     gain: float | None
     weight: float
     level: int
+    takes_target: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         for name, value in (("gain", self.gain), ("weight", self.weight)):
@@ -182,20 +186,58 @@ class PoseTask(FrameTask):
 
     def flat_target(self, robot: Robot, target: Any) -> Floats:
         """Return a homogeneous matrix (16,) by rows."""
-        if isinstance(target, pin.SE3):
-            return target.homogeneous.ravel()
-        right = isinstance(target, np.ndarray) and target.dtype == np.float64
-        matrix = target if right else as_floats("a pose target", target)
-        if matrix.shape != (4, 4) or matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
-            raise InputError(
-                f"a pose target has shape {matrix.shape}; it needs a pin.SE3 or a homogeneous matrix (4, 4) whose last "
-                "row is 0 0 0 1"
-            )
-        return matrix.flatten()
+        return _flat_pose(target)
 
     def sizes(self, robot: Robot) -> tuple[int, int]:
         """Return the lengths of a homogeneous matrix and of a twist."""
         return 16, 6
+
+
+@dataclass(frozen=True)
+class RelativePoseTask(Task):
+    """Bring a frame to a pose in another frame of the robot: two hands on one body, or a hand beside the bus.
+
+    The target is a pin.SE3 or a homogeneous matrix (4, 4), frame to reference; the error (6,) is [position; rotation
+    vector], m and rad, in the axes of the reference, and the target's velocity (6,) stands there too. Where the base
+    goes plays no part, so that momentum does not enter its Jacobian.
+
+    Attributes:
+        frame: What is moved: any frame of the robot.
+        reference: Against what: any other frame, on another arm, on the same one or on the base.
+    """
+
+    frame: str
+    reference: str
+    gain: float | None = None
+    weight: float = 1.0
+    level: int = 1
+
+    @property
+    def word(self) -> str:
+        """Its name in messages and records."""
+        return "relative pose"
+
+    def pieces(self, robot: Robot) -> list[Piece]:
+        """Return three rows of position and three of rotation."""
+        joint, pose, moves = _on_arm(robot, self.frame)
+        holder, reference, carried = _on_arm(robot, self.reference)
+        moves = moves - carried
+        return [
+            Piece(kernel.POINTS, ("x", "y", "z"), moves, joint, *_split(pose), 3, 4, 0, holder, reference),
+            Piece(kernel.TURNS, ("rx", "ry", "rz"), moves, joint, *_split(pose), 0, 4, 3, holder, reference),
+        ]
+
+    def flat_target(self, robot: Robot, target: Any) -> Floats:
+        """Return a homogeneous matrix (16,) by rows."""
+        return _flat_pose(target)
+
+    def sizes(self, robot: Robot) -> tuple[int, int]:
+        """Return the lengths of a homogeneous matrix and of a twist."""
+        return 16, 6
+
+    def owner(self, robot: Robot) -> str:
+        """Return both frames."""
+        return f"{self.frame} in {self.reference}"
 
 
 @dataclass(frozen=True)
@@ -288,6 +330,43 @@ class PostureTask(Task):
         return "joint"
 
 
+@dataclass(frozen=True)
+class ManipulabilityTask(Task):
+    """Move the joints to where the tasks of level 1 have more freedom, with what the levels before leave.
+
+    The joint rates asked for are the gain times the gradient of log w, w the product of the singular values of J_1
+    N_sub: its manipulability under the protection (Yoshikawa 1985). They are held to a quarter of the rate limits, as a
+    whole, so that they hardly slow the tasks down. It takes no target. The gradient is found by finite differences and
+    costs the matrices of n more configurations.
+    """
+
+    gain: float | None = None
+    weight: float = 1.0
+    level: int = 2
+    takes_target: ClassVar[bool] = False
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.level == 1:
+            raise InputError("a manipulability task serves those of level 1, so its level is 2 or more")
+
+    def pieces(self, robot: Robot) -> list[Piece]:
+        """Return a row a joint."""
+        return [Piece(kernel.CLIMBS, robot.joint_names, np.arange(1.0, robot.n_joints + 1))]
+
+    def flat_target(self, robot: Robot, target: Any) -> Floats:
+        """Return nothing."""
+        return np.zeros(0)
+
+    def sizes(self, robot: Robot) -> tuple[int, int]:
+        """Return nothing for the target and a rate a joint, which the law fills."""
+        return 0, robot.n_joints
+
+    def owner(self, robot: Robot) -> str:
+        """Return the word for rows that name their joint themselves."""
+        return "joint"
+
+
 class Layout:
     """The tasks of a law: how their rows and targets stand in the kernel's arrays, which follow the levels.
 
@@ -301,6 +380,7 @@ class Layout:
         slowest_gain: Of the tasks of level 1, 1/s.
         tool_position: The three rows of the end-effector's position; None if no task has them.
         tool_target: Where their targets stand in the flat targets.
+        climbs: Where the rates of a manipulability task stand in the flat velocities, and its gain; None without one.
         table: The kernel's `tasks` (pieces, TASK_SIZE).
         moves: The last rows of the kernel's `columns` (pieces, n).
         target_sizes: Length of the flat targets and of the flat velocities.
@@ -319,6 +399,7 @@ class Layout:
         lines, moves, names, counts, place = [], [], list[str](), [0] * len(numbers), [0, 0]
         self.tool_position: slice | None = None
         self.tool_target: slice | None = None
+        self.climbs: tuple[slice, float] | None = None
         for i in self._order:
             task, first = self.tasks[i], len(names)
             level = numbers.index(task.level)
@@ -326,6 +407,8 @@ class Layout:
                 lines.append(_line(piece, level, gain if task.gain is None else task.gain, task.weight, place))
                 moves.append(piece.moves)
                 tool = piece.kind == kernel.POINTS and task.owner(robot) == robot.end_effector
+                if piece.kind == kernel.CLIMBS:
+                    self.climbs = slice(place[1], place[1] + robot.n_joints), float(lines[-1][kernel.GAIN])
                 if tool and self.tool_position is None:
                     start, stride = place[0] + piece.target, piece.stride
                     self.tool_position = slice(len(names), len(names) + 3)
@@ -374,12 +457,27 @@ class Layout:
             return np.zeros(size)
         return _numbers(f"the target velocity of a {task.word} task", velocity, size, "m/s or rad/s")
 
-    def _one_a_task(self, name: str, values: Any) -> Any:
-        words = ", ".join(task.word for task in self.tasks)
-        if not isinstance(values, Sequence | np.ndarray) or len(values) != len(self.tasks):
+    def _one_a_task(self, name: str, values: Any) -> list[Any]:
+        """Return a value for each task, None for those that take no target."""
+        words = [task.word for task in self.tasks if task.takes_target]
+        if len(words) == 1:
+            values = [values]
+        elif not isinstance(values, Sequence | np.ndarray) or len(values) != len(words):
             found = len(values) if isinstance(values, Sequence | np.ndarray) else "no sequence"
-            raise InputError(f"{name}: {found}; give {len(self.tasks)}, one a task, in their order: {words}")
-        return values
+            raise InputError(f"{name}: {found}; give {len(words)}, one a task, in their order: {', '.join(words)}")
+        left = iter(values)
+        return [next(left) if task.takes_target else None for task in self.tasks]
+
+    def any_target(self) -> Floats:
+        """Return flat targets that could be some: positions zero, no turn, any direction."""
+        flat = np.zeros(self.target_sizes[0])
+        for line in self.table:
+            start, stride = int(line[kernel.TARGET]), int(line[kernel.STRIDE])
+            if line[kernel.KIND] == kernel.TURNS:
+                flat[start : start + 2 * stride + 3 : stride + 1] = 1.0
+            if line[kernel.KIND] == kernel.LOOKS:
+                flat[start] = 1.0
+        return flat
 
     def strange_target(self, targets: Floats) -> str:
         """Say which of flat targets is none: it is no rotation, or no direction."""
@@ -401,7 +499,26 @@ def _line(piece: Piece, level: int, gain: float, weight: float, place: Sequence[
     """Return a piece's row of the kernel's `tasks`; the task's target and velocity begin at `place`."""
     where = [place[0] + piece.target, piece.stride, place[1] + piece.velocity]
     numbers = [piece.kind, level, len(piece.row_names), piece.joint, gain, np.sqrt(weight), *where]
-    return [*numbers, *piece.point, *piece.axes.ravel()]
+    reference = [piece.reference, *piece.reference_pose.translation, *piece.reference_pose.rotation.ravel()]
+    return [*numbers, *piece.point, *piece.axes.ravel(), *reference]
+
+
+def _split(pose: pin.SE3) -> tuple[Floats, Floats]:
+    return pose.translation, pose.rotation
+
+
+def _flat_pose(target: Any) -> Floats:
+    """Return a homogeneous matrix (16,) by rows."""
+    if isinstance(target, pin.SE3):
+        return target.homogeneous.ravel()
+    right = isinstance(target, np.ndarray) and target.dtype == np.float64
+    matrix = target if right else as_floats("a pose target", target)
+    if matrix.shape != (4, 4) or matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
+        raise InputError(
+            f"a pose target has shape {matrix.shape}; it needs a pin.SE3 or a homogeneous matrix (4, 4) whose last "
+            "row is 0 0 0 1"
+        )
+    return matrix.flatten()
 
 
 def _on_arm(robot: Robot, name: str | None) -> tuple[int, pin.SE3, Floats]:
@@ -428,13 +545,24 @@ def checked_tasks(robot: Robot, tasks: Task | Sequence[Task]) -> tuple[Task, ...
     for task in given:
         if not isinstance(task, Task):
             raise InputError(
-                f"{task!r} is no task; use PositionTask, OrientationTask, PoseTask, BoresightTask, PostureTask"
+                f"{task!r} is no task; use PositionTask, OrientationTask, PoseTask, RelativePoseTask, BoresightTask, "
+                "PostureTask or ManipulabilityTask"
             )
-        if not all(piece.moves.any() for piece in task.pieces(robot)):
+        moving = all(piece.moves.any() for piece in task.pieces(robot))
+        if not moving and isinstance(task, RelativePoseTask):
+            raise InputError(
+                f"a relative pose task cannot move frame '{task.frame}' of '{robot.name}' against '{task.reference}': "
+                "no joint is between the two; name frames of different bodies"
+            )
+        if not moving:
             raise InputError(
                 f"a {task.word} task cannot move frame '{task.owner(robot)}' of '{robot.name}': no joint carries it, "
                 "it is fixed to the base; name a frame on an arm (what the base does is for a Protection)"
             )
+    if sum(isinstance(task, ManipulabilityTask) for task in given) > 1:
+        raise InputError("there are two manipulability tasks, which ask for the same; drop one")
+    if not any(task.level == 1 or task.takes_target for task in given):
+        raise InputError("a manipulability task needs another task to serve: add one, such as PositionTask()")
     return given
 
 

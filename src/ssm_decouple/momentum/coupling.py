@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -52,6 +52,7 @@ class Coupling:
     base_position: Floats
     base_rotation: Floats
     mass: float
+    _placed: tuple[Robot, pin.Data] = field(repr=False, compare=False)
 
     @classmethod
     def at(cls, robot: Robot, q: ArrayLike) -> Coupling:
@@ -82,12 +83,27 @@ class Coupling:
             base_position=_fixed(position),
             base_rotation=_fixed(R),
             mass=robot.mass,
+            _placed=(robot, data),
         )
 
     @property
     def J_gt(self) -> Floats:
         """Translational generalized Jacobian (3, n), inertial axes: the paper's J_g,t (eq. 10)."""
         return self.J_g[:3]
+
+    def rotation_of(self, frame: str) -> Floats:
+        """Return the rotation (3, 3) from the axes of "base", "inertial" or a frame of the robot to those of `frame`.
+
+        Raises:
+            ModelError: the robot has no such frame.
+        """
+        robot, data = self._placed
+        if frame in ("base", "inertial"):
+            R = self.base_rotation if frame == "base" else np.eye(3)
+        else:
+            held = robot.model.frames[robot.frame_id(frame)]
+            R = data.oMi[held.parentJoint].rotation @ held.placement.rotation
+        return self.base_rotation.T @ R if self.frame == "base" else R
 
     def inertial(self) -> Coupling:
         """Return the same matrices in inertial axes: N_H_ww = R H_ww R^T, N_H_wq = R H_wq, N_J_rc = R J_rc."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -13,7 +13,6 @@ if TYPE_CHECKING:
     from ssm_decouple.momentum.coupling import Coupling
 
 Floats = NDArray[np.float64]
-Frame = Literal["base", "inertial"]
 
 AXES = {"roll": (1.0, 0.0, 0.0), "pitch": (0.0, 1.0, 0.0), "yaw": (0.0, 0.0, 1.0)}
 NAMES = ("none", *AXES, "all")
@@ -33,8 +32,9 @@ class Protection:
         axes: A direction (3,), columns (3, k) with k up to 3, a twist (6,), columns (6, k) with k up to 6, or a name:
             "none" (k = 0), "roll", "pitch", "yaw", several joined by "+", or "all" (k = 3, reactionless). They must be
             orthonormal within 1e-3; they are made orthonormal to machine precision by the smallest possible change.
-        frame: The axes in which the directions stay fixed: "base" (the paper's) or "inertial". Inertial axes turn the
-            linear and the angular part alike; the point is the base origin in both.
+        frame: The axes in which the directions stay fixed: "base" (the paper's), "inertial", or any frame of the robot,
+            such as an antenna on a joint of its own. They turn the linear and the angular part alike; what must not
+            move is the base, and the point its origin, in all of them.
 
     Attributes:
         U_c: Orthonormal columns (3, k) or (6, k), as given, read-only.
@@ -52,12 +52,12 @@ class Protection:
         'k = 1, base axes: (0.500011, 0, 0.866019), 30.0007 deg from yaw'
     """
 
-    def __init__(self, axes: ArrayLike | str, frame: Frame = "base") -> None:
-        if frame not in ("base", "inertial"):
-            raise InputError(f"frame is 'base' or 'inertial', not '{frame}'")
+    def __init__(self, axes: ArrayLike | str, frame: str = "base") -> None:
+        if not (isinstance(frame, str) and frame):
+            raise InputError(f"frame is 'base', 'inertial' or the name of a frame of the robot, not {frame!r}")
         given = _named(axes) if isinstance(axes, str) else _columns(axes)
         _refuse_far_from_orthonormal(given)
-        self.frame: Frame = frame
+        self.frame: str = frame
         self.U_c: Floats = _nearest_orthonormal(given)
         self.k: int = self.U_c.shape[1]
         self.U_twist: Floats = np.vstack([np.zeros((6 - len(self.U_c), self.k)), self.U_c])
@@ -65,7 +65,7 @@ class Protection:
         self.correction: float = max(map(_angle, given.T, self.U_c.T), default=0.0)
 
     @classmethod
-    def boresight(cls, direction: ArrayLike, frame: Frame = "base") -> Protection:
+    def boresight(cls, direction: ArrayLike, frame: str = "base") -> Protection:
         """Protect a line of sight: the two directions across it, so that the base may only turn about it.
 
         Args:
@@ -86,7 +86,7 @@ class Protection:
         return cls(across.T, frame)
 
     @classmethod
-    def from_modes(cls, participation: ArrayLike, frame: Frame = "base") -> Protection:
+    def from_modes(cls, participation: ArrayLike, frame: str = "base") -> Protection:
         """Protect what excites flexible appendages: the span of their modes' participation vectors.
 
         Mode j is excited by participation_j . (base acceleration), so a base twist that stays orthogonal to every
@@ -125,21 +125,21 @@ class Protection:
     def parse(cls, text: str) -> Protection:
         """Read a protection from one word: a name, or numbers such as "0.5,0,0.866" or "1,0,0;0,0,1".
 
-        Give three numbers a direction or six a twist. Put ";" between directions and "@inertial" behind them where they
-        are fixed in inertial axes.
+        Give three numbers a direction or six a twist. Put ";" between directions and "@inertial" or "@" and the name of
+        a frame of the robot behind them where they are not fixed in base axes.
 
         Raises:
             InputError: as for the class, or the text cannot be read.
         """
         body, _, frame = text.partition("@")
         if any(letter.isalpha() for letter in body.replace("e", "").replace("nan", "").replace("inf", "")):
-            return cls(body, frame or "base")  # type: ignore[arg-type]
+            return cls(body, frame or "base")
         try:
             rows = [[float(word) for word in row.split(",")] for row in body.split(";")]
             columns = np.array(rows).T
         except ValueError:
             raise InputError(f"cannot read the protection '{text}': {_HELP}") from None
-        return cls(columns, frame or "base")  # type: ignore[arg-type]
+        return cls(columns, frame or "base")
 
     def __repr__(self) -> str:
         return f"Protection({self.U_c.T.tolist()}, frame={self.frame!r})"
@@ -162,7 +162,7 @@ class Protection:
         """Return U_c, (3, k) or (6, k) as it was given, in the axes of the coupling's matrices."""
         if self.frame == coupling.frame:
             return self.U_c
-        R = coupling.base_rotation if self.frame == "base" else coupling.base_rotation.T
+        R = coupling.rotation_of(self.frame)
         return np.vstack([R @ part for part in np.split(self.U_c, len(self.U_c) // 3)])
 
     def J_sub(self, coupling: Coupling) -> Floats:

@@ -16,7 +16,7 @@ from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_posit
 from ssm_decouple.model.plant import Plant
 from ssm_decouple.model.robot import UNLIMITED, Robot
 from ssm_decouple.simulation import physics
-from ssm_decouple.simulation.motion import twist_along
+from ssm_decouple.simulation.motion import flagged_spans, rotations_to, twist_along
 
 Floats = NDArray[np.float64]
 
@@ -200,7 +200,8 @@ class DynamicMotion:
     Args:
         settings: The physics.
         law: The law that commands it.
-        q: Start configuration of the law's robot (nq,); everything is at rest and the appendages are straight.
+        q: Start configuration of the law's robot (nq,); joints are at rest, appendages straight, and base and all move
+            as the law's momentum on board makes them.
         dt: Time between samples, s.
 
     Raises:
@@ -220,6 +221,9 @@ class DynamicMotion:
         self.start = self.plant.configuration(self.plant.rigid.configuration(there, robot.base_pose(q)))
         self.q = self._positions(self.start)
         self.v: Floats = np.zeros(self.plant.robot.model.nv)
+        model = self.plant.robot.model
+        A_g = pin.computeCentroidalMap(model, model.createData(), self.start)
+        self.v[:6] = np.linalg.solve(A_g[:, :6], law.momentum)
         attitude = pin.Quaternion(q[3:7]).matrix()
         self._plant_moved: Floats = np.zeros(self.plant.robot.model.nv)
         self._law_moved: Floats = np.zeros(robot.model.nv)
@@ -227,13 +231,19 @@ class DynamicMotion:
         self.reference: Floats = self.q[self.driven].copy()
         self.torques: Floats = np.zeros((2, robot.n_joints))
         self.totals: Floats = np.zeros(physics.TOTALS_SIZE)
-        self.measured: Floats = np.zeros(law.protection.k)
+        self.directions, self.axes = law.directions
+        self.measured: Floats = np.zeros(self.directions.shape[1])
         self._samples: list[tuple[Floats, Floats, Floats, Floats]] = []
         self._noise = np.random.default_rng(settings.sensors.seed if settings.sensors else 0)
         self._limits = _torque_limits(robot, settings.servo)
         joints = np.vstack([self.plant.stiffness, self.plant.damping])
         protects = settings.servo is not None and settings.servo.protects
-        spared = law.protection.U_twist.copy() if protects else np.zeros((6, 0))
+        if protects and (self.axes not in ("base", "inertial") or law.shares(np.zeros(1), q[None]) is not None):
+            raise InputError(
+                "a servo that protects holds one protection, fixed in base or inertial axes: no schedule and no axes "
+                f"of '{self.axes}'"
+            )
+        spared = self.directions.copy() if protects else np.zeros((6, 0))
         self._spared_motion: Floats = np.zeros(spared.shape[1])
         trees = (*tree_of(self.plant.robot.model), joints, self.driven, *tree_of(robot.model))
         self._constants = (*trees, self._limits, spared)
@@ -280,7 +290,7 @@ class DynamicMotion:
             FloatingPointError: the motion has diverged; the message says when.
         """
         held, before = _holding(self.settings, t, t_next), self.totals[:6].copy()
-        held[physics.INERTIAL] = float(self.law.protection.frame == "inertial")
+        held[physics.INERTIAL] = float(self.axes == "inertial")
         bad = physics.advance(
             *self._constants,
             held,
@@ -304,13 +314,14 @@ class DynamicMotion:
         self._samples.append((self.configuration(), self.v.copy(), self.torques[0].copy(), self.totals.copy()))
 
     def _measure(self, twist: Floats, dt: float) -> None:
-        told, sensors, protection = twist.copy(), self.settings.sensors, self.law.protection
+        told, sensors = twist.copy(), self.settings.sensors
         if sensors is not None:
             told[3:] += sensors.gyro_noise * dt * self._noise.standard_normal(3)
-        if protection.frame == "inertial":
-            R = self.pose[:9].reshape(3, 3)
+        turned = rotations_to(self.law.robot, self.axes, self._law_configuration(self.q[self.driven])[None])
+        if turned is not None:
+            R = turned[0]
             told = np.r_[R @ told[:3], R @ told[3:]]
-        self.measured += protection.U_twist.T @ told
+        self.measured += self.directions.T @ told
 
     def complete(self, motion: xr.Dataset) -> xr.Dataset:
         """Return the record of the motion with the truth about the plant in it.
@@ -328,10 +339,9 @@ class DynamicMotion:
         momenta, centres, points, energies, carried = self._audit(configurations, velocities)
         hinges = np.array([self._positions(q) for q in configurations])[:, self.plant.hinges]
         spring = 0.5 * hinges**2 @ self.plant.stiffness[self.plant.hinges]
-        protection = self.law.protection
         replaced = {
             "protected_rate": twist_along(
-                protection.U_twist, protection.frame, velocities[:, :6], motion.base_quaternion.values
+                self.directions, self.axes, velocities[:, :6], motion.configuration.values, self.law.robot
             ),
             "base_linear_velocity": velocities[:, :3],
             "base_angular_velocity": velocities[:, 3:6],
@@ -371,10 +381,10 @@ class DynamicMotion:
         drift = np.abs(change - change[0]).reshape(-1, 2, 3).max((0, 2))
         motion.attrs |= {
             "physics": json.dumps(self.settings.describe()),
-            "energy_error": float(np.abs(energy - work).max() / max(energy.max(), TINY)),
+            "energy_error": float(np.abs(energy - energy[0] - work).max() / max(energy.max(), TINY)),
             "momentum_drift": float(np.max(drift / carried)),
             "largest_torques": json.dumps(self.torques[1].tolist()),
-            "saturated": json.dumps(_spans(motion.time.values, np.diff(totals[:, physics.SATURATED]) > 0)),
+            "saturated": json.dumps(flagged_spans(motion.time.values, np.diff(totals[:, physics.SATURATED]) > 0)),
         }
         return motion
 
@@ -395,12 +405,6 @@ class DynamicMotion:
             points[i] = pin.updateFramePlacement(model, data, frame).translation
             energies[i] = pin.computeKineticEnergy(model, data, q, v)
         return momenta, centres, points, energies, carried
-
-
-def _spans(time: Floats, flags: NDArray[np.bool_]) -> list[list[float]]:
-    """Return from when to when (s) the holds between samples (m - 1,) are flagged."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
-    return [[float(time[start]), float(time[end])] for start, end in edges.reshape(-1, 2)]
 
 
 def _holding(settings: Dynamic, t: float, t_next: float) -> Floats:
@@ -450,6 +454,8 @@ def _refuse_unfit_feedback(settings: Dynamic, law: SelectiveLaw, dt: float) -> N
             f"feedback_gain is {settings.feedback_gain:g} 1/s, with {dt:g} s between samples it overshoots: use "
             f"{1 / dt:.3g} 1/s or less"
         )
+    if settings.feedback_gain and law.shares(np.zeros(1), np.zeros((1, law.robot.model.nq))) is not None:
+        raise InputError("feedback_gain takes back what one protection has lost; a schedule has several: leave it out")
     if settings.feedback_gain and np.any(law.protection.U_twist[:3]):
         raise InputError(
             "feedback_gain takes back what gyros tell, and the protection has rows of translation, which they do not; "

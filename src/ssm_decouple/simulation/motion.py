@@ -17,6 +17,7 @@ from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.errors import FileError
 from ssm_decouple.files import written_whole
+from ssm_decouple.model.robot import Robot
 
 Floats = NDArray[np.float64]
 
@@ -114,47 +115,86 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
 }
 
 
+_WHEEL_MOMENTUM = {"units": "N m s", "frame": "base", "long_name": "momentum of each wheel about its axis"}
+_SHARE = {"units": "1", "frame": "", "long_name": "how far each direction is protected: 0 not, 1 fully"}
 _TASK_ERROR = {"units": "m or rad", "frame": "as the task says", "long_name": "error of each task row"}
 
 
-def protected_integral(U_twist: Floats, frame: str, twists: Floats, configurations: Floats) -> Floats:
+def rotations_to(robot: Robot | None, frame: str, configurations: Floats) -> Floats | None:
+    """Return the rotations from base axes to those in which directions are fixed (m, 3, 3); None where they are base.
+
+    Args:
+        robot: The robot, needed where the frame is one of its own.
+        frame: "base", "inertial" or a frame of the robot.
+        configurations: (m, nq).
+    """
+    from scipy.spatial.transform import Rotation
+
+    if frame == "base":
+        return None
+    if frame == "inertial":
+        return Rotation.from_quat(np.ascontiguousarray(configurations[:, 3:7])).as_matrix()
+    assert robot is not None
+    held, data = robot.model.frames[robot.frame_id(frame)], robot.model.createData()
+    turned = np.empty((len(configurations), 3, 3))
+    for i, q in enumerate(configurations):
+        pin.forwardKinematics(robot.model, data, q)
+        axes = data.oMi[held.parentJoint].rotation @ held.placement.rotation
+        turned[i] = axes.T @ data.oMi[1].rotation
+    return turned
+
+
+def protected_integral(
+    U_twist: Floats, frame: str, twists: Floats, configurations: Floats, robot: Robot | None = None
+) -> Floats:
     """Return how far the base has moved along directions of its twist since the start (m, k), m and rad.
 
     Along directions fixed in base axes this is the integral of the twist's components. Along directions fixed in
     inertial axes the linear part is the displacement of the base origin, and for the angular part the rotations from
-    sample to sample are summed, which is its integral to second order in the time between samples.
+    sample to sample are summed, which is its integral to second order in the time between samples. So is the integral
+    along directions fixed in another frame.
 
     Args:
         U_twist: Directions of the base twist, columns (6, k).
-        frame: "base" or "inertial".
+        frame: "base", "inertial" or a frame of the robot.
         twists: Integral of the base twist, base axes (m, 6), m and rad.
         configurations: Configurations (m, nq), of which the base poses are read.
+        robot: The robot, needed where the frame is one of its own.
     """
     from scipy.spatial.transform import Rotation
 
     if frame == "base" or len(twists) == 1:
         return twists @ U_twist
-    attitude = Rotation.from_quat(np.ascontiguousarray(configurations[:, 3:7]))
-    turns = np.zeros((len(twists), 3))
-    turns[1:] = np.cumsum((attitude[1:] * attitude[:-1].inv()).as_rotvec(), axis=0)
-    return np.hstack([configurations[:, :3] - configurations[0, :3], turns]) @ U_twist
+    if frame == "inertial":
+        attitude = Rotation.from_quat(np.ascontiguousarray(configurations[:, 3:7]))
+        turns = np.zeros((len(twists), 3))
+        turns[1:] = np.cumsum((attitude[1:] * attitude[:-1].inv()).as_rotvec(), axis=0)
+        return np.hstack([configurations[:, :3] - configurations[0, :3], turns]) @ U_twist
+    turned = rotations_to(robot, frame, configurations)
+    assert turned is not None
+    between = 0.5 * (turned[1:] + turned[:-1])
+    steps = np.diff(twists, axis=0).reshape(-1, 2, 3)
+    moved = np.zeros_like(twists)
+    moved[1:] = np.cumsum(np.einsum("mij,mbj->mbi", between, steps).reshape(-1, 6), axis=0)
+    return moved @ U_twist
 
 
-def twist_along(U_twist: Floats, frame: str, twists: Floats, quaternions: Floats) -> Floats:
+def twist_along(
+    U_twist: Floats, frame: str, twists: Floats, configurations: Floats, robot: Robot | None = None
+) -> Floats:
     """Return the components of base twists along directions (m, k), m/s and rad/s.
 
     Args:
         U_twist: Directions of the base twist, columns (6, k).
-        frame: "base" or "inertial".
+        frame: "base", "inertial" or a frame of the robot.
         twists: Base twists in base axes (m, 6).
-        quaternions: Base attitudes (m, 4), x y z w.
+        configurations: Configurations (m, nq).
+        robot: The robot, needed where the frame is one of its own.
     """
-    from scipy.spatial.transform import Rotation
-
-    if frame == "base":
-        return twists @ U_twist
-    attitude = Rotation.from_quat(quaternions)
-    return np.hstack([attitude.apply(twists[:, :3]), attitude.apply(twists[:, 3:])]) @ U_twist
+    turned = rotations_to(robot, frame, configurations)
+    if turned is not None:
+        twists = np.einsum("mij,mbj->mbi", turned, twists.reshape(-1, 2, 3)).reshape(-1, 6)
+    return twists @ U_twist
 
 
 def build_motion(
@@ -176,8 +216,10 @@ def build_motion(
     from scipy.spatial.transform import Rotation
 
     robot, model = law.robot, law.robot.model
-    n, k, m = robot.n_joints, law.protection.k, time.size
+    n, m, (U_twist, axes) = robot.n_joints, time.size, law.directions
+    k = U_twist.shape[1]
     results, layout = values[:, 6 + n :], law.layout
+    shares = law.shares(time, configurations)
     errors = results[:, kernel.ERRORS : kernel.ERRORS + layout.size]
     nowhere = np.full((m, 3), np.nan)
     attitude = Rotation.from_quat(configurations[:, 3:7])
@@ -197,9 +239,11 @@ def build_motion(
         "base_rpy": attitude.as_euler("ZYX")[:, ::-1],
         "base_linear_velocity": values[:, :3],
         "base_angular_velocity": values[:, 3:6],
-        "protected_rate": results[:, kernel.PROTECTED_RATE : kernel.PROTECTED_RATE + k],
+        "protected_rate": results[:, kernel.PROTECTED_RATE : kernel.PROTECTED_RATE + k]
+        if shares is None
+        else twist_along(U_twist, axes, values[:, :6], configurations, robot),
         "base_twist_integral": twists,
-        "protected_angle": protected_integral(law.protection.U_twist, law.protection.frame, twists, configurations),
+        "protected_angle": protected_integral(U_twist, axes, twists, configurations, robot),
         "end_effector_position": results[:, kernel.POSITION : kernel.POSITION + 3],
         "target_position": nowhere if layout.tool_target is None else targets[:, layout.tool_target],
         "end_effector_error": np.linalg.norm(
@@ -213,7 +257,7 @@ def build_motion(
         "linear_momentum": momenta[:, :3],
         "angular_momentum": momenta[:, 3:],
         "centre_of_mass": centres,
-        "U_c": law.protection.U_twist,
+        "U_c": U_twist,
         "robot_urdf": np.array(robot.urdf, dtype=object),
     }
     variables = {}
@@ -231,7 +275,45 @@ def build_motion(
     if not layout.usual:
         variables["task_error"] = xr.Variable(("time", "task_row"), errors, _TASK_ERROR, fastpath=True)
         coordinates |= {"task_row": list(layout.row_names), "task_level": ("task_row", np.array(layout.row_levels))}
-    return xr.Dataset(variables, coordinates, _attributes(law))
+    if shares is not None:
+        variables["protected_share"] = xr.Variable(("time", "protected"), shares, _SHARE, fastpath=True)
+    attributes = _attributes(law)
+    if robot.wheel_names:
+        stored, spans = _wheels(law, time, values)
+        variables["wheel_momentum"] = xr.Variable(("time", "wheel"), stored, _WHEEL_MOMENTUM, fastpath=True)
+        coordinates["wheel"] = list(robot.wheel_names)
+        attributes["saturated_wheels"] = json.dumps(spans)
+    return xr.Dataset(variables, coordinates, attributes)
+
+
+def _wheels(law: SelectiveLaw, time: Floats, values: Floats) -> tuple[Floats, dict[str, list[list[float]]]]:
+    """Return the momentum about its axis of each wheel (m, wheels), and from when to when (s) each was at full speed.
+
+    A command is held until the next sample, so a wheel leaves saturation at the first sample that slows it down.
+    """
+    robot, spans = law.robot, {}
+    stored = np.empty((len(time), len(robot.wheel_names)))
+    for i, name in enumerate(robot.wheel_names):
+        joint = robot.model.joints[robot.model.getJointId(name)]
+        axis, at = np.ravel(joint.createData().S)[3:], robot.joint_index(name)
+        spin_inertia = axis @ robot.model.inertias[joint.id].inertia @ axis
+        speed = values[:, 6 + at]
+        stored[:, i] = spin_inertia * (speed + values[:, 3:6] @ axis)
+        full = np.abs(speed) >= (1.0 - 1e-9) * law.rate_limits[at]
+        if full.any():
+            spans[name] = flagged_spans(time, full[:-1] if len(time) > 1 else full)
+    return stored, spans
+
+
+def flagged_spans(time: Floats, flags: NDArray[np.bool_]) -> list[list[float]]:
+    """Return from when to when (s) the holds between samples (m - 1,) are flagged."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], flags, [False]]).astype(int)))
+    return [[float(time[start]), float(time[end])] for start, end in edges.reshape(-1, 2)]
+
+
+def robot_of(motion: xr.Dataset) -> Robot:
+    """Return the robot of a motion, as its record holds it."""
+    return Robot(str(motion.robot_urdf.item()), name=motion.attrs["robot"], end_effector=motion.attrs["end_effector"])
 
 
 def _joint_positions(model: pin.Model, configurations: Floats) -> Floats:

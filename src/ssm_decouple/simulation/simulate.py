@@ -54,7 +54,9 @@ def simulate(
     progress: Progress | None = None,
     smooth_start: float = 0.0,
 ) -> xr.Dataset:
-    """Simulate the arm moving under a law while momentum turns and shifts the free base, from rest.
+    """Simulate the arm moving under a law while momentum turns and shifts the free base.
+
+    Joints start at rest; the base too, unless the law has momentum on board: that is then the truth.
 
     Args:
         law: The law, called at every sample.
@@ -165,7 +167,7 @@ class _Run:
         if self.dynamic is not None:
             self.dynamic.sample()
             seen, wanted = self.dynamic.seen(), self.dynamic.correction()
-        self.law.evaluate(seen, self.targets[i], velocity, self.values[i], previous, wanted, pace)
+        self.law.evaluate(seen, self.targets[i], velocity, self.values[i], previous, wanted, pace, time[i])
         self.done = i + 1
 
     def _move(self, i: int) -> tuple[Floats, Floats]:

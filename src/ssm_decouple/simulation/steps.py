@@ -38,9 +38,13 @@ def held(
     In base axes its twist depends on the joints alone, so the base pose at those points is not needed. The
     coefficients are those of Blanes, Casas and Ros; the brackets change sign because the twist stands on the right.
     The integral of the twist is taken on five points, more than any law plans with, so that it judges them.
+
+    With momentum on board the twist does depend on the attitude, and the fourth-order method takes its place.
     """
     model, h = law.robot.model, t_next - t
     rates = values[6 : model.nv]
+    if law.momentum.any():
+        return _munthe_kaas(model, q, values[: model.nv], h, lambda x, _: np.r_[law.base_twist(x, rates), rates])
     turning = np.r_[np.zeros(6), rates]
 
     def twist(node: float) -> Floats:
@@ -59,22 +63,40 @@ def held(
 def runge_kutta(
     law: SelectiveLaw, reference: Reference, pace: Pace, q: Floats, values: Floats, t: float, t_next: float
 ) -> tuple[Floats, Floats]:
-    """Classical fourth order in the coordinates u = difference(q, .) about the step's start (Munthe-Kaas).
+    """Call the law within the step too, by the classical fourth-order method."""
+    model, buffer = law.robot.model, np.empty(law.size)
+
+    def velocity(stage: Floats, ahead: float) -> Floats:
+        law.evaluate(stage, *reference(t + ahead), buffer, pace=pace(t + ahead), time=t + ahead)
+        return buffer[: model.nv].copy()
+
+    return _munthe_kaas(model, q, values[: model.nv], t_next - t, velocity)
+
+
+def _munthe_kaas(
+    model: pin.Model, q: Floats, start: Floats, h: float, velocity: Callable[[Floats, float], Floats]
+) -> tuple[Floats, Floats]:
+    """Take a step of the classical fourth order in the coordinates u = difference(q, .) about the step's start.
 
     There u_dot = d(difference)/dq v, which carries the curvature of SE(3) exactly.
+
+    Args:
+        model: Pinocchio's.
+        q: Configuration at the start (nq,).
+        start: Velocity there (nv,).
+        h: Length of the step, s.
+        velocity: Of a configuration and the time since the start, s.
     """
-    model, h = law.robot.model, t_next - t
-    buffer = np.empty(law.size)
 
-    def slope(u: Floats, time: float) -> tuple[Floats, Floats]:
+    def slope(u: Floats, ahead: float) -> tuple[Floats, Floats]:
         stage = pin.integrate(model, q, u)
-        law.evaluate(stage, *reference(time), buffer, pace=pace(time))
-        return pin.dDifference(model, q, stage, pin.ARG1) @ buffer[: model.nv], buffer[:6].copy()
+        v = velocity(stage, ahead)
+        return pin.dDifference(model, q, stage, pin.ARG1) @ v, v[:6]
 
-    u1, t1 = values[: model.nv], values[:6]
-    u2, t2 = slope(0.5 * h * u1, t + 0.5 * h)
-    u3, t3 = slope(0.5 * h * u2, t + 0.5 * h)
-    u4, t4 = slope(h * u3, t + h)
+    u1, t1 = start, start[:6]
+    u2, t2 = slope(0.5 * h * u1, 0.5 * h)
+    u3, t3 = slope(0.5 * h * u2, 0.5 * h)
+    u4, t4 = slope(h * u3, h)
     moved = (h / 6.0) * (t1 + 2.0 * t2 + 2.0 * t3 + t4)
     return pin.integrate(model, q, (h / 6.0) * (u1 + 2.0 * u2 + 2.0 * u3 + u4)), moved
 

@@ -13,8 +13,9 @@ import numpy as np
 import xarray as xr
 
 from ssm_decouple.files import written_whole
+from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
-from ssm_decouple.simulation.motion import protected_integral, twist_along
+from ssm_decouple.simulation.motion import protected_integral, robot_of, twist_along
 from ssm_decouple.studies.case import Case
 
 LAWS = ("none", "selective", "reactionless")
@@ -129,9 +130,14 @@ def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[An
     if np.array_equal(U_c, motion.U_c.values) and frame == json.loads(motion.attrs["law"])["frame"]:
         return motion.protected_rate.values, motion.protected_angle.values
     twists = np.hstack([motion.base_linear_velocity.values, motion.base_angular_velocity.values])
-    rate = twist_along(U_c, frame, twists, motion.base_quaternion.values)
-    angle = protected_integral(U_c, frame, motion.base_twist_integral.values, motion.configuration.values)
+    robot, configurations = _robot_with(frame, motion), motion.configuration.values
+    rate = twist_along(U_c, frame, twists, configurations, robot)
+    angle = protected_integral(U_c, frame, motion.base_twist_integral.values, configurations, robot)
     return rate, angle
+
+
+def _robot_with(frame: str, motion: xr.Dataset) -> Robot | None:
+    return None if frame in ("base", "inertial") else robot_of(motion)
 
 
 def largest_rotation_deg(motion: xr.Dataset, protection: Protection) -> float:
@@ -144,7 +150,8 @@ def largest_rotation_deg(motion: xr.Dataset, protection: Protection) -> float:
     turning = protection.U_twist.copy()
     turning[:3] = 0.0
     twists, configurations = motion.base_twist_integral.values, motion.configuration.values
-    turned = protected_integral(turning, protection.frame, twists, configurations)
+    robot = _robot_with(protection.frame, motion)
+    turned = protected_integral(turning, protection.frame, twists, configurations, robot)
     return float(np.rad2deg(np.abs(turned).max(initial=0.0)))
 
 

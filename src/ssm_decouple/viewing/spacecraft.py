@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.model.urdf import Shape, visual_shapes
+from ssm_decouple.simulation.motion import robot_of
 from ssm_decouple.viewing.style import PAGE, PROTECTED, TARGET
 
 Floats = NDArray[np.float64]
@@ -27,7 +28,7 @@ _VIEW = {"elev": 24.0, "azim": 132.0}
 
 def draw_configurations(motion: xr.Dataset) -> Figure:
     """Draw the spacecraft at the start and at the end of a motion, side by side."""
-    robot = Robot(str(motion.robot_urdf.values), name=motion.attrs["robot"], end_effector=motion.attrs["end_effector"])
+    robot = robot_of(motion)
     turned = json.loads(motion.attrs.get("turned", "{}"))
     figure = Figure(figsize=(PAGE, 3.2))
     for i, (sample, label) in enumerate(((0, "start"), (-1, "end"))):
