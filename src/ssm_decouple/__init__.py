@@ -17,6 +17,8 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ssm_decouple.control.arrays import base_twist_map as base_twist_map
+    from ssm_decouple.control.arrays import selective_rates as selective_rates
     from ssm_decouple.control.law import Command as Command
     from ssm_decouple.control.law import SelectiveLaw as SelectiveLaw
     from ssm_decouple.control.schedule import Schedule as Schedule
@@ -105,6 +107,7 @@ _HOME = {
     "TumblingTarget": "simulation.reference",
     "Waypoints": "simulation.reference",
     "Wheel": "model.wheels",
+    "base_twist_map": "control.arrays",
     "cases": "studies.case",
     "compare": "studies.comparison",
     "compose": "model.compose",
@@ -115,6 +118,7 @@ _HOME = {
     "models": "model.catalogue",
     "perturbed": "model.perturb",
     "save_motion": "simulation.motion",
+    "selective_rates": "control.arrays",
     "simulate": "simulation.simulate",
 }
 

@@ -1198,3 +1198,45 @@ def held_command(
     return solve(
         matrices, drift, U_c, tasks, columns, parameters, targets, velocities, previous, out, rates, scratch, small
     )
+
+
+@compiled_for(f"int64({_ROWS}, {_ROWS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR}, float64, float64, {_VECTOR})")
+def rates_of(
+    J_sub: Floats,
+    J_task: Floats,
+    velocity: Floats,
+    wanted: Floats,
+    rate_limits: Floats,
+    scale: Floats,
+    damping: float,
+    threshold: float,
+    q_dot: Floats,
+) -> int:
+    """Write the rates (n,) of one level of tasks into q_dot from its Jacobian (m, n) and J_sub (k, n), k up to 6.
+
+    `wanted` (k,) is what J_sub q_dot shall be; the others are those of `columns` and `parameters`. Return OK or
+    NOT_FINITE.
+    """
+    (k, n), m = J_sub.shape, J_task.shape[0]
+    matrices, drift, U_c = np.zeros((J_TASK + m, n)), np.zeros((J_TASK + m, 1)), np.zeros((6, k))
+    tasks, columns, parameters = np.zeros((1, TASK_SIZE)), np.zeros((MOVES + 1, n)), np.zeros(PARAMETERS_SIZE)
+    for j in range(n):
+        columns[RATE_LIMIT, j], columns[SCALE, j] = rate_limits[j], scale[j]
+        for i in range(k):
+            matrices[J_PROTECTED + i, j] = J_sub[i, j]
+        for r in range(m):
+            matrices[J_TASK + r, j] = J_task[r, j]
+    for i in range(k):
+        U_c[i, i], parameters[WANTED_RATE + i] = 1.0, wanted[i]
+    tasks[0, KIND], tasks[0, ROWS], tasks[0, ROOT_WEIGHT] = CLIMBS, m, 1.0
+    parameters[THRESHOLD], parameters[DAMPING_LIMIT] = threshold, damping
+    parameters[LEVELS], parameters[PACE] = 1.0, 1.0
+    out, scratch = np.zeros(6 + n + ERRORS + m + 2), np.empty((16 + m, n))
+    small = np.empty((max(2 * m + 7, 11), 6 + m))
+    nothing, rates = np.zeros(n), np.zeros(m)
+    status = solve(
+        matrices, drift, U_c, tasks, columns, parameters, rates, velocity, nothing, out, rates, scratch, small
+    )
+    for j in range(n):
+        q_dot[j] = out[6 + j]
+    return status

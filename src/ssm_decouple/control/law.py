@@ -446,8 +446,8 @@ class SelectiveLaw:
                 zeros from rest.
             protected_rate: b (k,), what the protected rate shall be, rad/s, or m/s and rad/s; None for zero. The arm
                 makes it with the smallest rates J_sub^+ b; the task uses null(J_sub), and yields first at the rate
-                limits. Where J_sub^+ b alone exceeds them it is scaled to them as a whole, and where J_sub has not the rank for b,
-                the nearest b that there is takes its place: the command's `protected_rate` tells.
+                limits. Where J_sub^+ b alone exceeds them it is scaled to them as a whole, and where J_sub has not the
+                rank for b, the nearest b that there is takes its place: the command's `protected_rate` tells.
             pace: In [0, 1], scales the time of the command but not b: gain, target velocity and rate limits times
                 pace, so that with b = 0 the command is pace times the plain one (damped as that is). Beside rates
                 J_sub^+ b the limits move from these, at pace 0, to the full ones, at pace 1.
