@@ -988,6 +988,34 @@ def solve(
     return OK if np.isfinite(total) else NOT_FINITE
 
 
+@compiled
+def log_manipulability(matrices: Floats, U_c: Floats, columns: Floats, parameters: Floats, count: int) -> float:
+    """Return log of the product of the singular values of J_1 N_sub, J_1 being the first `count` task rows.
+
+    Minus infinity at a singularity. Weights of the joints scale the columns, as they do in `solve`.
+    """
+    n, k = columns.shape[1], U_c.shape[1]
+    rows, weights, diagonal, order = np.zeros((k + count, n)), np.empty(k + count), np.empty(k), np.zeros(k)
+    source = J_PROTECTED if parameters[AXES_JOINT] >= 0.0 else J_BASE
+    square = 0.0
+    for j in range(n):
+        for i in range(k):
+            for b in range(6):
+                rows[i, j] += columns[SCALE, j] * U_c[b, i] * matrices[source + b, j]
+            square += rows[i, j] ** 2
+        for r in range(count):
+            rows[k + r, j] = columns[SCALE, j] * matrices[J_TASK + r, j]
+    rank = factor_protected_rows(rows, weights, diagonal, order, k, NOISE * np.sqrt(square))
+    if rank + count > n:
+        return -np.inf
+    total = 0.0
+    for t in range(count):
+        total += np.log(abs(reflect(rows, weights, k + t, rank + t)))
+        for i in range(k + t + 1, k + count):
+            apply_reflection(rows, weights, k + t, rank + t, rows[i])
+    return total
+
+
 @inlined
 def wrong_size(n: int, parameters: Floats, targets: Floats, velocities: Floats, previous: Floats, out: Floats) -> bool:
     """Say whether an array has the wrong length: compiled code would read past its end."""

@@ -352,29 +352,35 @@ class SelectiveLaw:
             _, singular, right = np.linalg.svd(J[rows] @ Z)
             Z = Z @ right[int(np.sum(singular > 1e-9 * np.linalg.norm(J[rows]))) :].T
 
+    def _matrices_at(self, q: Floats) -> Floats:
+        """Return the kernel's matrices (J_TASK + m, n) at q; they depend on no target."""
+        model, data, _, (_, _, columns, _), fixed = self._prepared
+        pin.computeCentroidalMap(model, data, q)
+        if self._reads_joints:
+            kernel.read_joints(q, columns)
+        matrices, drift, rates = np.zeros_like(self._matrices), np.zeros_like(self._drift), np.zeros(self.layout.size)
+        out = np.zeros(self.size)
+        kernel.add_matrices(*fixed, self._any_target, self._at_rest, 1.0, matrices, drift, rates, out)
+        return matrices
+
     def _task_jacobian(self, q: Floats) -> Floats:
         """Return the generalized Jacobian of the task rows (m, n) at q, each times the root of its task's weight."""
-        model, data, _, _, fixed = self._prepared
-        targets, velocities = np.zeros(self.layout.target_sizes[0]), self._at_rest
-        pin.computeCentroidalMap(model, data, q)
-        matrices, drift, rates = np.zeros_like(self._matrices), np.zeros_like(self._drift), np.zeros(self.layout.size)
-        kernel.add_matrices(*fixed, targets, velocities, 1.0, matrices, drift, rates, np.zeros(self.size))
-        return matrices[kernel.J_TASK :]
+        return self._matrices_at(q)[kernel.J_TASK :]
 
     def _rates_that_climb(self, q: ArrayLike, gain: float) -> Floats:
         """Return gain times the gradient of log w (n,), w the manipulability of level 1, by finite differences."""
-        model, start = self.robot.model, self.robot.checked(q)
-        rows = self.layout.level_rows[0]
+        model, _, _, (U_c, _, columns, parameters), _ = self._prepared
+        start, count = self.robot.checked(q), self.layout.level_rows[0].stop
+        turn, slopes = np.zeros(model.nv), np.zeros(self._n)
 
-        def log_volume(at: Floats) -> float:
-            J = self._task_jacobian(at)[rows] @ self.protection.null_space_basis(self.robot.coupling(at))
-            return 0.5 * float(np.linalg.slogdet(J @ J.T)[1])
+        def log_manipulability(at: Floats) -> float:
+            return kernel.log_manipulability(self._matrices_at(at), U_c, columns, parameters, count)
 
-        here, turn, slopes = log_volume(start), np.zeros(model.nv), np.zeros(self._n)
+        here = log_manipulability(start)
         for j in range(self._n):
             turn[:] = 0.0
             turn[6 + j] = CLIMB_STEP
-            slopes[j] = gain * (log_volume(pin.integrate(model, start, turn)) - here) / CLIMB_STEP
+            slopes[j] = gain * (log_manipulability(pin.integrate(model, start, turn)) - here) / CLIMB_STEP
         if not np.all(np.isfinite(slopes)):  # at a singularity all ways lead up
             return np.zeros(self._n)
         return slopes / max(1.0, float(np.max(np.abs(slopes) / (CLIMB_SHARE * self.rate_limits))))

@@ -127,7 +127,12 @@ class Schedule:
             told += weight * inside
         return told
 
-    def describe(self) -> list[dict[str, Any]]:
+    def describe(self) -> str:
+        """Say when each protection begins to enter, and what it is."""
+        starts = [f"from {start:g} s " for start in self._starts.tolist()] or [""] * len(self.protections)
+        return "; then ".join(start + p.describe() for start, p in zip(starts, self.protections, strict=True))
+
+    def settings(self) -> list[dict[str, Any]]:
         """Return the schedule in plain types, for a record."""
         starts = self._starts.tolist() or [None] * len(self.protections)
         return [
@@ -282,4 +287,4 @@ class ScheduledLaw(SelectiveLaw):
 
     def describe(self) -> dict[str, Any]:
         """Return the law's settings in plain types, for a record."""
-        return {**super().describe(), "U_c": self.schedule.U_twist.tolist(), "schedule": self.schedule.describe()}
+        return {**super().describe(), "U_c": self.schedule.U_twist.tolist(), "schedule": self.schedule.settings()}

@@ -311,6 +311,14 @@ def flagged_spans(time: Floats, flags: NDArray[np.bool_]) -> list[list[float]]:
     return [[float(time[start]), float(time[end])] for start, end in edges.reshape(-1, 2)]
 
 
+def error_of(motion: xr.Dataset) -> Floats:
+    """Return how far a motion is from its target (m,): m, or of other tasks the norm of all errors of level 1."""
+    if "task_error" not in motion:
+        return motion.end_effector_error.values
+    first = motion.task_error.values[:, motion.task_level.values == 1]
+    return np.linalg.norm(first, axis=1)
+
+
 def robot_of(motion: xr.Dataset) -> Robot:
     """Return the robot of a motion, as its record holds it."""
     return Robot(str(motion.robot_urdf.item()), name=motion.attrs["robot"], end_effector=motion.attrs["end_effector"])

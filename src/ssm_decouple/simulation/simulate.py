@@ -14,7 +14,7 @@ from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_not_negative, as_triple
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
-from ssm_decouple.simulation.motion import build_motion, judge
+from ssm_decouple.simulation.motion import build_motion, error_of, judge
 from ssm_decouple.simulation.steps import STEPS, Pace, Reference
 
 Floats = NDArray[np.float64]
@@ -190,10 +190,7 @@ class _Run:
         )
         if self.dynamic is not None:
             motion = self.dynamic.complete(motion)
-        tolerance, error = self.settings["arrival_tolerance"], motion.end_effector_error.values
-        if not law.layout.usual:
-            error = np.linalg.norm(self.errors[:done], axis=1)
-        outcome = judge(time, error, tolerance, 1.0 / law.layout.slowest_gain)
+        outcome = judge(time, error_of(motion), self.settings["arrival_tolerance"], 1.0 / law.layout.slowest_gain)
         motion.attrs |= {
             "method": "dynamic" if self.dynamic is not None else self.method,
             **self.settings,

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 import xarray as xr
 
+from ssm_decouple.control.schedule import Schedule
 from ssm_decouple.errors import InputError
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.dynamic import Dynamic, Servo
@@ -70,7 +71,7 @@ def flexible(case: Case) -> Case:
     return replace(case, robot_source=FLEXIBLE)
 
 
-def protections_of(case: Case) -> dict[str, Protection]:
+def protections_of(case: Case) -> dict[str, Protection | Schedule]:
     """Return what to compare: nothing, the case's own, the appendages' first bending modes, all rotation."""
     return {
         "none": Protection("none"),

@@ -18,6 +18,17 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ssm_decouple.control.law import SelectiveLaw
+from ssm_decouple.control.schedule import Schedule, ScheduledLaw
+from ssm_decouple.control.task import (
+    BoresightTask,
+    ManipulabilityTask,
+    OrientationTask,
+    PoseTask,
+    PositionTask,
+    PostureTask,
+    RelativePoseTask,
+    Task,
+)
 from ssm_decouple.errors import DecoupleError, InputError, as_floats
 from ssm_decouple.model.catalogue import load_robot, models
 from ssm_decouple.model.robot import Robot
@@ -36,7 +47,7 @@ Floats = NDArray[np.float64]
 _FOLDER = Path(__file__).parent / "cases"
 
 # What a case file may hold: table, key, what the value must be, and whether it has to be there.
-_NUMBER, _SWITCH, _TEXT, _NUMBERS, _JOINTS, _AXES, _TURNS = (
+_NUMBER, _SWITCH, _TEXT, _NUMBERS, _JOINTS, _AXES, _TURNS, _NAMES, _LIST, _PHASES = (
     "a number",
     "true or false",
     "a text",
@@ -44,6 +55,9 @@ _NUMBER, _SWITCH, _TEXT, _NUMBERS, _JOINTS, _AXES, _TURNS = (
     "a list of numbers or a table by joint name",
     "a name or a list of directions such as [[0, 0, 1]]",
     "a table of angles by the name of a visual",
+    "a list of names",
+    "a list of numbers",
+    "a list of tables { from = .., axes = .. }",
 )
 _SCHEMA: dict[str, dict[str, tuple[str, bool]]] = {
     "": {"title": (_TEXT, False), "robot": (_TEXT, True), "end_effector": (_TEXT, False)},
@@ -52,9 +66,16 @@ _SCHEMA: dict[str, dict[str, tuple[str, bool]]] = {
         "joints": (_JOINTS, False),
         "base_position": (_NUMBERS, False),
         "base_rpy_deg": (_NUMBERS, False),
+        "linear_momentum": (_NUMBERS, False),
+        "angular_momentum": (_NUMBERS, False),
     },
-    "target": {"position": (_NUMBERS, True)},
-    "protection": {"axes": (_AXES, True), "frame": (_TEXT, False)},
+    "target": {"position": (_NUMBERS, False)},
+    "protection": {
+        "axes": (_AXES, False),
+        "frame": (_TEXT, False),
+        "phases": (_PHASES, False),
+        "hand_over": (_NUMBER, False),
+    },
     "law": {
         "gain": (_NUMBER, False),
         "rate_limit_deg": (_NUMBER, False),
@@ -64,6 +85,7 @@ _SCHEMA: dict[str, dict[str, tuple[str, bool]]] = {
         "hold_nodes": (_NUMBER, False),
         "acceleration_limit_deg": (_NUMBER, False),
         "acceleration_limit": (_NUMBER, False),
+        "joint_weights": (_LIST, False),
     },
     "simulation": {
         "duration": (_NUMBER, True),
@@ -85,6 +107,20 @@ _SCHEMA: dict[str, dict[str, tuple[str, bool]]] = {
 }
 DRIVES = ("torque", "prescribed")
 
+# What a [[task]] of each kind takes beside kind, gain, weight and level; True where it has to be there.
+_POSE = {"position": (_NUMBERS, True), "rpy_deg": (_NUMBERS, True)}
+_FRAME = {"frame": (_TEXT, False)}
+_TASKS: dict[str, tuple[type[Task], dict[str, tuple[str, bool]]]] = {
+    "position": (PositionTask, {**_FRAME, "position": (_NUMBERS, True)}),
+    "orientation": (OrientationTask, {**_FRAME, "rpy_deg": (_NUMBERS, True)}),
+    "pose": (PoseTask, {**_FRAME, **_POSE}),
+    "relative_pose": (RelativePoseTask, {"frame": (_TEXT, True), "reference": (_TEXT, True), **_POSE}),
+    "boresight": (BoresightTask, {**_FRAME, "direction": (_NUMBERS, True), "toward": (_NUMBERS, True)}),
+    "posture": (PostureTask, {"joints": (_NAMES, False), "positions": (_LIST, False), "positions_deg": (_LIST, False)}),
+    "manipulability": (ManipulabilityTask, {}),
+}
+_ANY_TASK = {"kind": (_TEXT, True), "gain": (_NUMBER, False), "weight": (_NUMBER, False), "level": (_NUMBER, False)}
+
 
 @dataclass(frozen=True)
 class Case:
@@ -98,10 +134,10 @@ class Case:
         joints: Start joint positions by joint name or in order, rad or m.
         base_position: Start position of the base origin (3,), m.
         base_rpy: Start roll, pitch, yaw of the base (3,), rad.
-        target: Desired end-effector position (3,), m, inertial axes.
-        protection: The case's own protection.
+        target: Desired end-effector position (3,), m, inertial axes, or what the law's tasks take.
+        protection: The case's own protection, or a schedule of several.
         law: Further arguments of `SelectiveLaw`: gain, rate_limit, damping, damping_threshold, hold_nodes,
-            acceleration_limit. The law's sample time is `dt`.
+            acceleration_limit, tasks, joint_weights, momentum. The law's sample time is `dt`.
         duration: s.
         dt: Time between samples, s.
         simulation: Further arguments of `simulate`: method, arrival_tolerance, smooth_start.
@@ -116,8 +152,8 @@ class Case:
     joints: Floats | Mapping[str, float] | None
     base_position: tuple[float, ...]
     base_rpy: tuple[float, ...]
-    target: tuple[float, ...]
-    protection: Protection
+    target: Any
+    protection: Protection | Schedule
     law: Mapping[str, Any] = field(default_factory=dict)
     duration: float = 150.0
     dt: float = 0.1
@@ -147,16 +183,20 @@ class Case:
         pose = pin.SE3(pin.rpy.rpyToMatrix(*self.base_rpy), np.array(self.base_position))
         return self.robot.configuration(self.joints, pose)
 
-    def make_law(self, protection: Protection | None = None, dt: float | None = None) -> SelectiveLaw:
+    def make_law(self, protection: Protection | Schedule | None = None, dt: float | None = None) -> SelectiveLaw:
         """Return the case's law, with another protection or time between samples than its own if one is given."""
         step = self.dt if dt is None else dt
         planned = "hold_nodes" in self.law or "acceleration_limit" in self.law
-        return SelectiveLaw(
-            self.robot, protection or self.protection, sample_time=step if planned else None, **self.law
-        )
+        chosen, sample_time = protection or self.protection, step if planned else None
+        if isinstance(chosen, Schedule):
+            return ScheduledLaw(self.robot, chosen, sample_time=sample_time, **self.law)
+        return SelectiveLaw(self.robot, chosen, sample_time=sample_time, **self.law)
 
     def run(
-        self, protection: Protection | None = None, dt: float | None = None, progress: Progress | None = None
+        self,
+        protection: Protection | Schedule | None = None,
+        dt: float | None = None,
+        progress: Progress | None = None,
     ) -> xr.Dataset:
         """Simulate the case.
 
@@ -226,7 +266,6 @@ def load_case(source: str | Path) -> Case:
 def _case(content: dict[str, Any], path: Path) -> Case:
     _validate(content)
     start, law, simulation = (content.get(table, {}) for table in ("start", "law", "simulation"))
-    axes = content["protection"]["axes"]
     robot = content["robot"]
     law_arguments = {key: value for key, value in law.items() if not key.endswith("_deg")}
     for key in ("rate_limit", "acceleration_limit"):
@@ -234,6 +273,13 @@ def _case(content: dict[str, Any], path: Path) -> Case:
             if key in law:
                 raise InputError(f"give {key}_deg or {key}, not both")
             law_arguments[key] = float(np.deg2rad(law[f"{key}_deg"]))
+    if start.keys() & {"linear_momentum", "angular_momentum"}:
+        law_arguments["momentum"] = [
+            float(x) for part in ("linear", "angular") for x in start.get(f"{part}_momentum", (0, 0, 0))
+        ]
+    tasks, target = _tasks(content)
+    if tasks:
+        law_arguments["tasks"] = tasks
     return Case(
         name=path.stem,
         title=content.get("title", path.stem),
@@ -242,10 +288,8 @@ def _case(content: dict[str, Any], path: Path) -> Case:
         joints=_joints(start),
         base_position=tuple(map(float, start.get("base_position", (0, 0, 0)))),
         base_rpy=tuple(map(float, np.deg2rad(start.get("base_rpy_deg", (0, 0, 0))))),
-        target=tuple(map(float, content["target"]["position"])),
-        protection=Protection(
-            axes if isinstance(axes, str) else _directions(axes), content["protection"].get("frame", "base")
-        ),
+        target=target,
+        protection=_protection(content["protection"]),
         law=law_arguments,
         duration=float(simulation["duration"]),
         dt=float(simulation["dt"]),
@@ -256,6 +300,59 @@ def _case(content: dict[str, Any], path: Path) -> Case:
             for name, angle in content.get("spacecraft", {}).get("turned_deg", {}).items()
         },
     )
+
+
+def _protection(given: Mapping[str, Any]) -> Protection | Schedule:
+    frame = given.get("frame", "base")
+
+    def one(axes: Any) -> Protection:
+        return Protection(axes if isinstance(axes, str) else _directions(axes), frame)
+
+    if ("axes" in given) == ("phases" in given) or ("phases" in given) != ("hand_over" in given):
+        raise InputError("[protection] needs axes, or phases and hand_over for a schedule of several protections")
+    if "axes" in given:
+        return one(given["axes"])
+    pairs = [(phase["from"], one(phase["axes"])) for phase in given["phases"]]
+    return Schedule(pairs, hand_over=given["hand_over"])
+
+
+def _tasks(content: Mapping[str, Any]) -> tuple[list[Task], Any]:
+    """Return the tasks of a case, none for the end-effector's position alone, and their targets."""
+    tables, place = content.get("task"), content.get("target", {}).get("position")
+    if (tables is None) == (place is None):
+        raise InputError("give [target] position, or [[task]] tables with a target in each, and not both")
+    if tables is None:
+        return [], tuple(map(float, place))
+    if not isinstance(tables, list) or not tables:
+        raise InputError("'task' must be an array of tables: write [[task]] on a line of its own above each")
+    tasks, targets = [], []
+    for number, table in enumerate(tables, 1):
+        task, target = _task(table, f"[[task]] {number} ")
+        tasks.append(task)
+        if task.takes_target:
+            targets.append(target)
+    return tasks, targets[0] if len(targets) == 1 else targets
+
+
+def _task(table: Mapping[str, Any], place: str) -> tuple[Task, Any]:
+    kind = table.get("kind")
+    if kind not in _TASKS:
+        raise InputError(f"{place}{_unknown('kind', str(kind), list(_TASKS))}")
+    made, keys = _TASKS[kind]
+    _check_keys(table, {**_ANY_TASK, **keys}, place)
+    arguments = {key: table[key] for key in ("gain", "weight", "level", "frame", "reference") if key in table}
+    if kind == "boresight":
+        arguments["direction"] = tuple(table["direction"])
+    if "joints" in table:
+        arguments["joints"] = tuple(table["joints"])
+    if kind == "posture":
+        if ("positions" in table) == ("positions_deg" in table):
+            raise InputError(f"{place}needs positions or positions_deg, and not both")
+        return made(**arguments), table.get("positions", np.deg2rad(table.get("positions_deg", [])))
+    rotation = pin.rpy.rpyToMatrix(*np.deg2rad(np.array(table.get("rpy_deg", (0, 0, 0)), dtype=float)))
+    position = np.array(table.get("position", (0, 0, 0)), dtype=float)
+    targets = {"position": position, "orientation": rotation, "boresight": table.get("toward")}
+    return made(**arguments), targets.get(kind, pin.SE3(rotation, position))
 
 
 def _physics(content: Mapping[str, Any]) -> dict[str, Dynamic]:
@@ -299,26 +396,31 @@ def _directions(axes: list[Any]) -> Floats:
 
 
 def _validate(content: dict[str, Any]) -> None:
-    tables = [name for name in _SCHEMA if name]
+    tables = [*filter(None, _SCHEMA), "task"]
     for key, value in content.items():
         if key not in _SCHEMA[""] and key not in tables:
             raise InputError(_unknown("key", key, [*_SCHEMA[""], *tables]))
-        if key in tables and not isinstance(value, dict):
+        if key in tables and key != "task" and not isinstance(value, dict):
             raise InputError(f"'{key}' must be a table: write [{key}] on a line of its own")
     for table, keys in _SCHEMA.items():
         values = content.get(table, {}) if table else {k: v for k, v in content.items() if k not in tables}
-        place = f"[{table}] " if table else ""
-        for key, value in values.items():
-            if key not in keys:
-                raise InputError(f"{place}{_unknown('key', key, list(keys))}")
-            if not _fits(value, keys[key][0]):
-                raise InputError(f"{place}{key} is {value!r}; it must be {keys[key][0]}")
-        missing = [key for key, (_, needed) in keys.items() if needed and key not in values]
-        if missing:
-            raise InputError(f"{place}{missing[0]} is missing")
+        _check_keys(values, keys, f"[{table}] " if table else "")
+    for number, phase in enumerate(content["protection"].get("phases", []), 1):
+        _check_keys(phase, {"from": (_NUMBER, True), "axes": (_AXES, True)}, f"[protection] phase {number} ")
     method = content["simulation"].get("method", "explicit")
     if method not in (*STEPS, "dynamic"):
         raise InputError(f"[simulation] {_unknown('method', method, [*STEPS, 'dynamic'])}")
+
+
+def _check_keys(values: Mapping[str, Any], keys: Mapping[str, tuple[str, bool]], place: str) -> None:
+    for key, value in values.items():
+        if key not in keys:
+            raise InputError(f"{place}{_unknown('key', key, list(keys))}")
+        if not _fits(value, keys[key][0]):
+            raise InputError(f"{place}{key} is {value!r}; it must be {keys[key][0]}")
+    missing = [key for key, (_, needed) in keys.items() if needed and key not in values]
+    if missing:
+        raise InputError(f"{place}{missing[0]} is missing")
 
 
 def _unknown(kind: str, word: str, known: list[str]) -> str:
@@ -340,6 +442,12 @@ def _fits(value: Any, kind: str) -> bool:
         return isinstance(value, str)
     if kind == _NUMBERS:
         return isinstance(value, list) and len(value) == 3 and all(map(number, value))
+    if kind == _LIST:
+        return isinstance(value, list) and all(map(number, value))
+    if kind == _NAMES:
+        return isinstance(value, list) and all(isinstance(x, str) for x in value)
+    if kind == _PHASES:
+        return isinstance(value, list) and all(isinstance(x, dict) for x in value)
     if kind == _TURNS:
         return isinstance(value, dict) and all(map(number, value.values()))
     if kind == _AXES:

@@ -12,10 +12,11 @@ from typing import Any
 import numpy as np
 import xarray as xr
 
+from ssm_decouple.control.schedule import Schedule
 from ssm_decouple.files import written_whole
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
-from ssm_decouple.simulation.motion import protected_integral, robot_of, twist_along
+from ssm_decouple.simulation.motion import error_of, protected_integral, robot_of, twist_along
 from ssm_decouple.studies.case import Case
 
 LAWS = ("none", "selective", "reactionless")
@@ -83,7 +84,7 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         motion: A motion of a case, from `Case.run`.
         law: What the row is called.
     """
-    time, error = motion.time.values, motion.end_effector_error.values
+    time, error = motion.time.values, error_of(motion)
     rate, angle = disturbance(motion)
     swing = np.rad2deg(np.ptp(motion.base_rpy.values, axis=0))
     sigma = motion.smallest_singular_value.values
@@ -128,7 +129,7 @@ def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[An
     """
     U_c, frame = np.array(json.loads(motion.attrs["case_U_c"])).reshape(6, -1), motion.attrs["case_frame"]
     if np.array_equal(U_c, motion.U_c.values) and frame == json.loads(motion.attrs["law"])["frame"]:
-        return motion.protected_rate.values, motion.protected_angle.values
+        return _while_on(motion)
     twists = np.hstack([motion.base_linear_velocity.values, motion.base_angular_velocity.values])
     robot, configurations = _robot_with(frame, motion), motion.configuration.values
     rate = twist_along(U_c, frame, twists, configurations, robot)
@@ -136,11 +137,29 @@ def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[An
     return rate, angle
 
 
+def _while_on(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Return protected rate and angle; under a schedule zero while a direction is not fully protected.
+
+    The angle of a direction is counted from when it came to be.
+    """
+    rate, angle = motion.protected_rate.values, motion.protected_angle.values
+    if "protected_share" not in motion:
+        return rate, angle
+    on = motion.protected_share.values == 1.0
+    rate, angle = np.where(on, rate, 0.0), angle.copy()
+    for i in range(on.shape[1]):
+        begun = np.flatnonzero(on[:, i] & ~np.r_[False, on[:-1, i]])
+        which = np.searchsorted(begun, np.arange(len(on)), side="right") - 1
+        start = angle[begun[np.maximum(which, 0)], i] if begun.size else 0.0
+        angle[:, i] = np.where(on[:, i], angle[:, i] - start, 0.0)
+    return rate, angle
+
+
 def _robot_with(frame: str, motion: xr.Dataset) -> Robot | None:
     return None if frame in ("base", "inertial") else robot_of(motion)
 
 
-def largest_rotation_deg(motion: xr.Dataset, protection: Protection) -> float:
+def largest_rotation_deg(motion: xr.Dataset, protection: Protection | Schedule) -> float:
     """Return the largest true rotation of the base about directions, deg, whatever the motion's law protects.
 
     Args:
@@ -173,9 +192,13 @@ class Comparison:
         return [summarise(motion, law) for law, motion in self.motions.items()]
 
 
-def laws_of(case: Case) -> dict[str, Protection]:
+def laws_of(case: Case) -> dict[str, Protection | Schedule]:
     """Return the protections to compare: none, the case's own, all. One that the case has already is left out."""
-    chosen = {"none": Protection("none"), "selective": case.protection, "reactionless": Protection("all")}
+    chosen: dict[str, Protection | Schedule] = {
+        "none": Protection("none"),
+        "selective": case.protection,
+        "reactionless": Protection("all"),
+    }
     if case.protection.k == 0:
         del chosen["selective"]
     if case.protection.k == 3 and not np.any(case.protection.U_twist[:3]):
@@ -199,7 +222,7 @@ def compare_step_by_step(
     """
     undamped = replace(case, law={**case.law, "damping": 0.0})
 
-    def run(law: str, variant: Case, protection: Protection) -> xr.Dataset:
+    def run(law: str, variant: Case, protection: Protection | Schedule) -> xr.Dataset:
         return variant.run(protection, dt, None if progress is None else lambda share: progress(law, share))
 
     for law, protection in laws_of(case).items():

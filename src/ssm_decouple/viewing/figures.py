@@ -13,6 +13,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from ssm_decouple.simulation.motion import error_of
 from ssm_decouple.studies.bending import parts_of
 from ssm_decouple.studies.case import Case
 from ssm_decouple.studies.comparison import disturbance
@@ -105,7 +106,7 @@ def protected_rate(motion: xr.Dataset) -> Figure:
 def error(motion: xr.Dataset) -> Figure:
     """Draw the distance from the end-effector to the target."""
     figure, (axes,) = panels(1, height=1.9)
-    axes.semilogy(motion.time, 1e3 * motion.end_effector_error, color="black")
+    axes.semilogy(motion.time, 1e3 * error_of(motion), color="black")
     tolerance = 1e3 * float(motion.attrs["arrival_tolerance"])
     axes.axhline(tolerance, color="#8C8C8C", linewidth=0.7, linestyle="--")
     axes.text(
@@ -136,7 +137,7 @@ def comparison(motions: Mapping[str, xr.Dataset]) -> Figure:
         # The law in question lies on top, where the others would hide it.
         line: dict[str, Any] = {**LAW_LINES.get(law, {}), "label": law, "zorder": 3 if law == "selective" else 2}
         time = motion.time.values
-        distance.semilogy(time, 1e3 * motion.end_effector_error, **line)
+        distance.semilogy(time, 1e3 * error_of(motion), **line)
         rate = np.abs(disturbance(motion)[0]).max(axis=1, initial=0.0)
         disturbed.semilogy(time, np.maximum(rate, FLOOR), **{**line, "linewidth": 0.7})
         singular.semilogy(time, np.maximum(motion.smallest_singular_value, 1e-9), **{**line, "linewidth": 0.8})
@@ -241,7 +242,7 @@ def pointing(motions: Mapping[str, xr.Dataset]) -> Figure:
         line: dict[str, Any] = {**LAW_LINES.get(law, {}), "label": law, "linewidth": 0.9}
         wander = ARCSEC * pointing_error(motion, motion.attrs["boresight"])
         top.semilogy(motion.time[1:], np.maximum(wander[1:], 1e-12), **line)
-        bottom.semilogy(motion.time, 1e3 * motion.end_effector_error, **line)
+        bottom.semilogy(motion.time, 1e3 * error_of(motion), **line)
     top.set_ylabel("pointing error (arcsec)")
     bottom.set_ylabel("distance to target (mm)")
     figure.legend(*top.get_legend_handles_labels(), ncols=2, loc="outside upper center")
