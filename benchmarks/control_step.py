@@ -134,7 +134,7 @@ def pink_step(case: ssm.Case, q: Floats) -> Callable[[], Floats]:
 
 def pose_law(case: ssm.Case, q: Floats) -> tuple[ssm.SelectiveLaw, pin.SE3]:
     """Return the case's law for a pose, and one at the case's target, half a radian turned."""
-    law = ssm.SelectiveLaw(case.robot, case.protection, tasks=ssm.PoseTask())
+    law = ssm.SelectiveLaw(case.robot, case.make_law().protection, tasks=ssm.PoseTask())
     turn = pin.exp3(np.array([0.3, 0.2, 0.4]))
     return law, pin.SE3(turn @ case.robot.frame_pose(q).rotation, np.array(case.target))
 

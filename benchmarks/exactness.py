@@ -113,8 +113,8 @@ def own_J_sub(law: ssm.SelectiveLaw, q: Floats) -> Floats:
 def exact_rate(J_sub: Floats, rates: Floats) -> float:
     """Return the largest |J_sub q_dot| of the rows, summed without rounding."""
     exact = [Fraction(rate) for rate in rates.tolist()]
-    rows = (sum(Fraction(a) * x for a, x in zip(row, exact, strict=True)) for row in J_sub.tolist())
-    return float(max(abs(total) for total in rows))
+    totals = [sum((Fraction(a) * x for a, x in zip(row, exact, strict=True)), Fraction(0)) for row in J_sub.tolist()]
+    return max(abs(float(total)) for total in totals)
 
 
 def measure(trial: Trial) -> tuple[float, float]:

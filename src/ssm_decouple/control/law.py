@@ -185,6 +185,15 @@ class LostDirection:
     singular_value: float
     without: Floats
 
+    def told(self, law: SelectiveLaw) -> dict[str, Any]:
+        """Return it in plain types, for a record, with the names of the rows."""
+        return {
+            "rows": list(law.layout.row_names[law.layout.level_rows[0]]),
+            "direction": self.direction.tolist(),
+            "singular_value": self.singular_value,
+            "without": self.without.tolist(),
+        }
+
 
 class SelectiveLaw:
     """The paper's law: q_dot = (J_gt N_sub)^+ (x_dot_des + k_p (x_des - x)), scaled as a whole to the rate limits.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import warnings
 from collections.abc import Callable
 from typing import Any, Literal
@@ -12,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
+from ssm_decouple.control.schedule import ScheduledLaw
 from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_not_negative, as_triple
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import build_motion, error_of, judge
@@ -84,7 +86,8 @@ def simulate(
         end_effector_position, target_position, end_effector_error, smallest_singular_value, rate_scale, rate_blend,
         plan_change, damping, linear_momentum, angular_momentum, centre_of_mass, U_c, robot_urdf. Attributes: `outcome`
         ("converged", "stalled" or "running"), `outcome_time` (s), `final_error` (m), the law's settings, the method
-        and the versions. With other tasks than the end-effector's position there is also `task_error` (time, task_row),
+        and the versions. Of a stalled motion `lost_direction` (JSON) says in which direction the tasks of level 1 could
+        move least at its end, and how much better that would be without each protected row. With other tasks than the end-effector's position there is also `task_error` (time, task_row),
         m or rad, as the law sees it, each row with its name and `task_level`; where no task asks for a position of the
         end-effector, its target and error are not numbers. A dynamic motion has also joint_velocities, joint_torques,
         hinge_angles, tip_deflection, kinetic_energy, spring_energy, drive_work, load_work, damping_loss,
@@ -198,6 +201,8 @@ class _Run:
             "outcome_time": outcome.time,
             "final_error": outcome.error,
         }
+        if outcome.name == "stalled" and not isinstance(law, ScheduledLaw):
+            motion.attrs["lost_direction"] = json.dumps(law.lost_direction(self.configurations[done - 1]).told(law))
         return motion
 
 

@@ -51,6 +51,7 @@ class Summary:
         acceleration_max_deg_s2: Largest change of a joint rate from sample to sample, from rest on, over dt.
         centre_of_mass_drift_m: How far the centre of mass wandered: the integrator's error, zero in physics.
         saturated: In a dynamic simulation, from when to when, s, a drive stood at its torque limit.
+        lost: Of a stalled motion the direction that its tasks could move least at the end, and what took it, in words.
     """
 
     case: str
@@ -75,6 +76,7 @@ class Summary:
     acceleration_max_deg_s2: float
     centre_of_mass_drift_m: float
     saturated: tuple[tuple[float, float], ...] = ()
+    lost: str = ""
 
 
 def summarise(motion: xr.Dataset, law: str) -> Summary:
@@ -116,7 +118,22 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         acceleration_max_deg_s2=float(np.rad2deg(np.abs(changes / np.diff(time)[:, None]).max())),
         centre_of_mass_drift_m=float(np.linalg.norm(drift, axis=1).max()),
         saturated=tuple((start, end) for start, end in json.loads(motion.attrs.get("saturated", "[]"))),
+        lost=lost_direction(motion),
     )
+
+
+def lost_direction(motion: xr.Dataset) -> str:
+    """Return in words which direction a stalled motion had lost at its end, and to what; nothing of another."""
+    if "lost_direction" not in motion.attrs:
+        return ""
+    lost = json.loads(motion.attrs["lost_direction"])
+    rows = [f"{x:+.2f} {row}" for x, row in zip(lost["direction"], lost["rows"], strict=True) if abs(x) > 0.005]
+    told, here = f"it could move least along {', '.join(rows)}: {lost['singular_value']:.1e} m", lost["singular_value"]
+    best = int(np.argmax(lost["without"])) if lost["without"] else -1
+    if best < 0 or lost["without"][best] <= 2.0 * here:
+        return told + ", which no single protected row takes"
+    column = ", ".join(f"{x:.3g}" for x in motion.U_c.values[0 if np.any(motion.U_c.values[:3]) else 3 :, best] + 0.0)
+    return told + f"; without protected row {best + 1}, ({column}), {lost['without'][best]:.1e} m"
 
 
 def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:

@@ -182,4 +182,5 @@ def explain(row: Summary) -> str | None:
         f"{row.case}, {row.law}: {ended}, {1e3 * row.final_error_m:.0f} mm of {1e3 * row.start_distance_m:.0f} mm "
         f"left, end-effector at ({x:.3f}, {y:.3f}, {z:.3f}) m. Smallest singular value of J_gt N_sub "
         f"{row.sigma_min_m:.1e} m at {row.sigma_min_time_s:.1f} s{damped}."
+        + (f" At the end {row.lost}." if row.lost else "")
     )
