@@ -87,9 +87,10 @@ def simulate(
         plan_change, damping, linear_momentum, angular_momentum, centre_of_mass, U_c, robot_urdf. Attributes: `outcome`
         ("converged", "stalled" or "running"), `outcome_time` (s), `final_error` (m), the law's settings, the method
         and the versions. Of a stalled motion `lost_direction` (JSON) says in which direction the tasks of level 1 could
-        move least at its end, and how much better that would be without each protected row. With other tasks than the end-effector's position there is also `task_error` (time, task_row),
-        m or rad, as the law sees it, each row with its name and `task_level`; where no task asks for a position of the
-        end-effector, its target and error are not numbers. A dynamic motion has also joint_velocities, joint_torques,
+        move least at its end, and how much better that would be without each protected row. With other tasks
+        than the end-effector's position there is also `task_error` (time, task_row), m or rad, as the law sees
+        it, each row with its name and `task_level`; where no task asks for a position of the end-effector, its
+        target and error are not numbers. A dynamic motion has also joint_velocities, joint_torques,
         hinge_angles, tip_deflection, kinetic_energy, spring_energy, drive_work, load_work, damping_loss,
         saturated_time, and the attributes `physics`, `energy_error`, `momentum_drift` (both relative),
         `largest_torques` and `saturated`: from when to when a drive stood at its torque limit.
