@@ -1,5 +1,7 @@
 """One control step: the law against plain NumPy, Pink with hard constraints, and Pinocchio's bare calls.
 
+The steps with limits keep position, rate and acceleration limits joint by joint, from rates at which some act.
+
 All candidates take turns in one process, so that the ratios hold whatever the machine does meanwhile.
 
     python benchmarks/control_step.py [case1|case2|case3]
@@ -13,6 +15,7 @@ import sys
 import time
 from collections.abc import Callable
 from functools import partial
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads for 6 x 6 matrices would only hurt the competitors
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -27,6 +30,8 @@ Floats = NDArray[np.float64]
 
 ROUNDS = 25
 ROUND_TIME = 0.02  # s, how long each candidate runs in a round
+SAMPLE_TIME = 0.1  # s
+ACCELERATION = np.deg2rad(1.0)  # rad/s2, of the steps with limits
 
 
 def medians(candidates: dict[str, Callable[[], object]]) -> dict[str, float]:
@@ -81,8 +86,11 @@ def plain_numpy(case: ssm.Case, q: Floats) -> Callable[[], dict[str, object]]:
     return step
 
 
-def pink_step(case: ssm.Case, q: Floats) -> Callable[[], Floats]:
-    """Return the same velocity problem as Pink states it: zero momentum and zero protected rate as hard constraints."""
+def pink_step(case: ssm.Case, q: Floats, limited: bool = False) -> Callable[[], Floats]:
+    """Return the same velocity problem as Pink states it: zero momentum and zero protected rate as hard constraints.
+
+    With `limited` also Pink's own position, velocity and acceleration limits, from rest.
+    """
     import pink
     from pink.tasks import Task
 
@@ -112,7 +120,15 @@ def pink_step(case: ssm.Case, q: Floats) -> Callable[[], Floats]:
             pin.computeCentroidalMap(model, configuration.data, configuration.q)
             return np.vstack([configuration.data.Ag, select])
 
-    dt = 0.1
+    limits: list[Any] = []
+    if limited:
+        accelerations = np.r_[np.zeros(6), np.full(robot.n_joints, ACCELERATION)]
+        limits = [
+            pink.limits.ConfigurationLimit(model),
+            pink.limits.VelocityLimit(model),
+            pink.limits.AccelerationLimit(model, accelerations),
+        ]
+    dt = SAMPLE_TIME
     task, constraint = Position(cost=np.ones(3), gain=law.gain * dt), Momentum(cost=np.ones(6 + law.protection.k))
     configuration = pink.Configuration(model, data, q)
 
@@ -124,7 +140,7 @@ def pink_step(case: ssm.Case, q: Floats) -> Callable[[], Floats]:
             dt,
             solver="daqp",
             damping=1e-9,
-            limits=[],
+            limits=limits,
             constraints=[constraint],
             safety_break=False,
         )
@@ -137,6 +153,17 @@ def pose_law(case: ssm.Case, q: Floats) -> tuple[ssm.SelectiveLaw, pin.SE3]:
     law = ssm.SelectiveLaw(case.robot, case.make_law().protection, tasks=ssm.PoseTask())
     turn = pin.exp3(np.array([0.3, 0.2, 0.4]))
     return law, pin.SE3(turn @ case.robot.frame_pose(q).rotation, np.array(case.target))
+
+
+def limited_law(case: ssm.Case) -> ssm.SelectiveLaw:
+    """Return the case's law with position, rate and acceleration limits, joint by joint."""
+    return ssm.SelectiveLaw(
+        case.robot,
+        case.make_law().protection,
+        acceleration_limit=ACCELERATION,
+        sample_time=SAMPLE_TIME,
+        limits=ssm.Limits(),
+    )
 
 
 def bare_pinocchio(robot: ssm.Robot, q: Floats) -> Callable[[], object]:
@@ -170,6 +197,9 @@ def main(name: str) -> None:
         candidates[f"law(q, target), hold_nodes={nodes}"] = partial(planned, q, target)
     posing, pose = pose_law(case, q)
     candidates["law(q, pose), a PoseTask"] = lambda: posing(q, pose)
+    limiting, at_rest_joints = limited_law(case), np.zeros(case.robot.n_joints)
+    candidates["law(q, target), limits by QP"] = lambda: limiting(q, target, previous_rates=at_rest_joints)
+    acting = limiting(q, target, previous_rates=at_rest_joints).active_limits
     command = law(q, target)
     difference = np.abs(np.asarray(plain()["joint_rates"]) - command.joint_rates).max()
     print(f"{name}, {case.robot.name}, k = {law.protection.k}: plain NumPy differs by {difference:.1e} rad/s")
@@ -179,6 +209,7 @@ def main(name: str) -> None:
         print("Pink is not installed (pip install 'ssm-decouple[bench]'): left out")
     else:
         candidates["Pink, hard constraints, DAQP"] = pink
+        candidates["Pink, the same with limits"] = pink_step(case, q, limited=True)
         v = np.asarray(pink())
         reached = case.robot.coupling(q).J_gt @ v[6:]
         asked = law.gain * command.end_effector_error
@@ -196,6 +227,11 @@ def main(name: str) -> None:
     if "Pink, hard constraints, DAQP" in times:
         print(f", {times['Pink, hard constraints, DAQP'] / whole:.1f} times faster than Pink", end="")
     print(f",\nand takes {whole / base:.2f} times the bare Pinocchio calls; its array form {array / base:.2f} times.")
+    bounded = times["law(q, target), limits by QP"]
+    print(f"With {acting} limits that act a step takes {bounded / whole:.1f} times as long", end="")
+    if "Pink, the same with limits" in times:
+        print(f", and Pink {times['Pink, the same with limits'] / bounded:.1f} times that", end="")
+    print(".")
     print(f"A pose task takes {times['law(q, pose), a PoseTask'] / whole:.2f} times the position task.")
 
     for _ in range(3):

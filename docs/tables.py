@@ -3,7 +3,7 @@
 python docs/tables.py           # rewrite the blocks between <!-- begin NAME --> and <!-- end NAME -->
 python docs/tables.py --check   # exit status 1 if one is out of date
 python docs/tables.py speed robustness ..   # rewrite blocks that no check holds: timings differ from machine to
-                                            # machine, and the Monte Carlo study takes a quarter of an hour
+                                            # machine, and what is drawn at random takes a quarter of an hour
 """
 
 from __future__ import annotations
@@ -208,9 +208,10 @@ BLOCKS: dict[str, Callable[[], str]] = {
     "effects": effects_block,
 }
 KEPT: dict[str, Callable[[], str]] = {
-    "speed": lambda: printed_by("control_step.py"),
-    "dynamic_speed": lambda: printed_by("dynamic.py"),
+    "speed": lambda: printed_by("benchmarks/control_step.py"),
+    "dynamic_speed": lambda: printed_by("benchmarks/dynamic.py"),
     "robustness": robustness,
+    "two_arms": lambda: printed_by("examples/two_arms.py", "1000"),
 }
 
 
@@ -252,9 +253,9 @@ def sheets() -> dict[str, Figure]:
     }
 
 
-def printed_by(benchmark: str) -> str:
-    """Return what a benchmark prints here."""
-    words = [sys.executable, str(ROOT / "benchmarks" / benchmark)]
+def printed_by(script: str, *arguments: str) -> str:
+    """Return what a script prints here."""
+    words = [sys.executable, str(ROOT / script), *arguments]
     printed = subprocess.run(words, capture_output=True, text=True, check=True).stdout.strip()
     return f"```text\n{printed}\n```"
 

@@ -1,6 +1,10 @@
 from __future__ import annotations
 
+import sys
+import warnings
+from collections.abc import Callable
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import numpy as np
 import pytest
@@ -55,3 +59,22 @@ def write(tmp_path: Path):
         return path
 
     return writer
+
+
+@pytest.fixture
+def call(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., CompletedProcess[str]]:
+    """Run the command as its entry point does, in this process: a new one imports for two seconds."""
+    from ssm_decouple.cli import main
+
+    def caller(*words: object, cwd: Path | None = None) -> CompletedProcess[str]:
+        monkeypatch.setattr(sys, "argv", ["ssm-decouple", *map(str, words)])
+        capsys.readouterr()
+        with monkeypatch.context() as here, warnings.catch_warnings():
+            warnings.simplefilter("default")  # a warning is told, not raised as elsewhere in the tests
+            here.chdir(cwd or Path.cwd())
+            with pytest.raises(SystemExit) as left:
+                main()
+        out, err = capsys.readouterr()
+        return CompletedProcess(sys.argv, int(left.value.code or 0), out, err)
+
+    return caller

@@ -1,4 +1,4 @@
-"""The command as a user types it: in a process of its own where status, streams or signals matter."""
+"""The command as a user types it, in a process of its own where the shell sees more than words, streams and status."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from ssm_decouple.cli import app
 COMMAND = [sys.executable, "-c", "from ssm_decouple.cli import main; main()"]
 
 
-def call(*words, cwd=None):
+def in_a_process(*words, cwd=None):
     return subprocess.run([*COMMAND, *map(str, words)], capture_output=True, text=True, cwd=cwd, timeout=120)
 
 
@@ -39,8 +39,8 @@ def test_help_teaches():
     assert CliRunner().invoke(app, ["--version"]).output.strip() == ssm.__version__
 
 
-def test_run_writes_the_motion_and_the_figures(tmp_path):
-    done = call("run", "case1", "--no-progress", cwd=tmp_path)
+def test_run_writes_the_motion_and_the_figures(call, tmp_path):
+    done = in_a_process("run", "case1", "--no-progress", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "converged, 102 s" in done.stdout
     names = {path.name for path in (tmp_path / "results" / "case1").iterdir()}
@@ -54,7 +54,7 @@ def test_run_writes_the_motion_and_the_figures(tmp_path):
     assert len(list((tmp_path / "again").iterdir())) == 10
 
 
-def test_a_case_that_does_not_arrive_has_its_own_status(tmp_path):
+def test_a_case_that_does_not_arrive_has_its_own_status(call, tmp_path):
     done = call("run", "case1", "--protect", "all", "--no-figures", "-o", tmp_path, "--json")
     assert done.returncode == 3
     (row,) = json.loads(done.stdout)["rows"]
@@ -62,7 +62,7 @@ def test_a_case_that_does_not_arrive_has_its_own_status(tmp_path):
     assert done.stderr == ""
 
 
-def test_compare_prints_one_table_and_says_why(tmp_path):
+def test_compare_prints_one_table_and_says_why(call, tmp_path):
     done = call("compare", "case1", "--no-figures", "-o", tmp_path)
     assert done.returncode == 0
     assert "reactionless, undamped" in done.stdout
@@ -77,7 +77,7 @@ def test_compare_prints_one_table_and_says_why(tmp_path):
     }
 
 
-def test_options_reach_the_simulation(short_case, tmp_path):
+def test_options_reach_the_simulation(call, short_case, tmp_path):
     done = call(
         "run",
         short_case,
@@ -101,7 +101,7 @@ def test_options_reach_the_simulation(short_case, tmp_path):
     assert json.loads(done.stdout)["files"][0].endswith("protect_0.5_0_0.866@inertial.nc")
 
 
-def test_models_cases_and_check():
+def test_models_cases_and_check(call):
     assert json.loads(call("models", "--json").stdout)["ets_vii"]["joints"] == 6
     assert "ets_vii_flight" in call("models").stdout
     assert json.loads(call("cases", "--json").stdout)["case2"]["toml"].endswith("case2.toml")
@@ -112,7 +112,7 @@ def test_models_cases_and_check():
     assert json.loads(call("check", "ets_vii", "--json").stdout)["mass"] == pytest.approx(2690.4)
 
 
-def test_check_of_an_impossible_robot(write):
+def test_check_of_an_impossible_robot(call, write):
     text = ssm.models()["ets_vii"].read_text().replace('<mass value="35"/>', '<mass value="-35"/>')
     done = call("check", write(text))
     assert done.returncode == 1
@@ -133,7 +133,7 @@ def test_check_of_an_impossible_robot(write):
         (("plot", "nothing.nc"), "error: no motion at 'nothing.nc': not a file"),
     ],
 )
-def test_bad_input_is_one_line_and_status_1(tmp_path, words, says):
+def test_bad_input_is_one_line_and_status_1(call, tmp_path, words, says):
     done = call(*words, cwd=tmp_path)
     assert done.returncode == 1
     assert says in done.stderr
@@ -143,20 +143,20 @@ def test_bad_input_is_one_line_and_status_1(tmp_path, words, says):
 
 def test_an_output_that_cannot_be_written(tmp_path):
     (tmp_path / "taken").write_text("")
-    done = call("run", "case1", "--output", tmp_path / "taken")
+    done = in_a_process("run", "case1", "--output", tmp_path / "taken")
     assert done.returncode == 1
     assert "error: cannot write to the folder" in done.stderr
     assert "choose another with --output" in done.stderr
 
 
 def test_wrong_usage_is_status_2():
-    assert call("run").returncode == 2
-    assert call("fly").returncode == 2
+    assert in_a_process("run").returncode == 2
+    assert in_a_process("fly").returncode == 2
 
 
 def test_a_target_out_of_reach_warns_and_runs(write, tmp_path):
     text = ssm.cases()["case1"].read_text().replace("[-1.8, -0.3, 1.2]", "[-1.8, -0.3, 9.0]").replace("150  #", "2  #")
-    done = call("run", write(text, "far.toml"), "--no-figures", "-o", tmp_path)
+    done = in_a_process("run", write(text, "far.toml"), "--no-figures", "-o", tmp_path)
     assert done.returncode == 3
     assert "warning: the target (-1.8, -0.3, 9) m is 5.14 m beyond the arm's reach" in done.stderr
 
@@ -186,7 +186,7 @@ def test_ctrl_c_keeps_what_is_done(short_case, write, tmp_path):
     assert not list(Path(tmp_path).rglob("*.part*"))
 
 
-def test_the_equations_of_motion_from_the_command_line(short_case, tmp_path):
+def test_the_equations_of_motion_from_the_command_line(call, short_case, tmp_path):
     done = call("run", short_case, "--dynamic", "--no-figures", "-o", tmp_path, "--json")
     assert done.returncode == 3, done.stderr
     motion = ssm.load_motion(tmp_path / "short" / "selective.nc")
@@ -202,7 +202,7 @@ def test_the_equations_of_motion_from_the_command_line(short_case, tmp_path):
         ("pointing", ["--step", "0.01"], "peak_arcsec", {"pointing.png", "pointing_selective_planned.nc"}),
     ],
 )
-def test_a_study_writes_its_table_figures_and_motions(short_case, tmp_path, study, more, columns, per_case):
+def test_a_study_writes_its_table_figures_and_motions(call, short_case, tmp_path, study, more, columns, per_case):
     done = call("study", study, short_case, "-o", tmp_path, *more)
     assert done.returncode == 0, done.stderr
     assert columns in (tmp_path / f"{study}.csv").read_text().splitlines()[0]
@@ -210,7 +210,7 @@ def test_a_study_writes_its_table_figures_and_motions(short_case, tmp_path, stud
     assert "files in" in done.stdout
 
 
-def test_the_robustness_study(short_case, tmp_path):
+def test_the_robustness_study(call, short_case, tmp_path):
     words = ("study", "robustness", short_case, "-o", tmp_path, "--runs", "2", "--levels", "1,5", "--json")
     done = call(*words)
     assert done.returncode == 0, done.stderr
@@ -224,13 +224,13 @@ def test_the_robustness_study(short_case, tmp_path):
     assert {path.name for path in tmp_path.iterdir()} >= {"robustness.csv", "effects.csv", "robustness.pdf"}
 
 
-def test_numbers_that_cannot_be_read(short_case, tmp_path):
+def test_numbers_that_cannot_be_read(call, short_case, tmp_path):
     done = call("study", "pointing", short_case, "-o", tmp_path, "--boresight", "up")
     assert done.returncode == 1
     assert "--boresight is 'up'; give numbers with commas between them" in done.stderr
 
 
-def test_drives_that_are_too_weak_are_told_with_their_times(write, tmp_path):
+def test_drives_that_are_too_weak_are_told_with_their_times(call, write, tmp_path):
     """Joints of 1 N m cannot start as the law asks; the motion goes on and the times are told."""
     urdf = ssm.load_robot("ets_vii").urdf.replace('effort="100"', 'effort="1"')
     assert urdf != ssm.load_robot("ets_vii").urdf
@@ -243,7 +243,7 @@ def test_drives_that_are_too_weak_are_told_with_their_times(write, tmp_path):
     assert "0.0 to " in done.stdout
 
 
-def test_a_case_that_a_study_refuses_stops_it_before_it_starts(short_case, write, tmp_path):
+def test_a_case_that_a_study_refuses_stops_it_before_it_starts(call, short_case, write, tmp_path):
     bare = write(short_case.read_text().replace("axes = [[0, 0, 1]]", 'axes = "none"'), "bare.toml")
     assert 'axes = "none"' in bare.read_text()
     done = call("study", "robustness", short_case, bare, "-o", tmp_path / "out", "--runs", "1", "--levels", "5")
@@ -252,8 +252,8 @@ def test_a_case_that_a_study_refuses_stops_it_before_it_starts(short_case, write
     assert not (tmp_path / "out").exists()
 
 
-def test_a_part_that_the_robot_does_not_have_cannot_be_turned(short_case, write):
+def test_a_part_that_the_robot_does_not_have_cannot_be_turned(call, short_case, write, tmp_path):
     path = write(short_case.read_text() + "\n[spacecraft]\nturned_deg = { wing_lft = 30 }\n", "typo.toml")
-    done = call("run", path, "--no-figures")
+    done = call("run", path, "--no-figures", cwd=tmp_path)
     assert done.returncode == 1
     assert "unknown part 'wing_lft'; did you mean 'wing_left'?" in done.stderr

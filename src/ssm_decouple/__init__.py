@@ -19,8 +19,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from ssm_decouple.control.arrays import base_twist_map as base_twist_map
     from ssm_decouple.control.arrays import selective_rates as selective_rates
+    from ssm_decouple.control.collision import Clearance as Clearance
     from ssm_decouple.control.law import Command as Command
     from ssm_decouple.control.law import SelectiveLaw as SelectiveLaw
+    from ssm_decouple.control.limits import Limits as Limits
     from ssm_decouple.control.schedule import Schedule as Schedule
     from ssm_decouple.control.schedule import ScheduledLaw as ScheduledLaw
     from ssm_decouple.control.task import BoresightTask as BoresightTask
@@ -74,6 +76,7 @@ _HOME = {
     "Appendage": "model.appendage",
     "BoresightTask": "control.task",
     "Case": "studies.case",
+    "Clearance": "control.collision",
     "Command": "control.law",
     "Comparison": "studies.comparison",
     "Coupling": "momentum.coupling",
@@ -84,6 +87,7 @@ _HOME = {
     "Ellipsoid": "momentum.metrics",
     "FileError": "errors",
     "InputError": "errors",
+    "Limits": "control.limits",
     "Load": "simulation.dynamic",
     "ManipulabilityTask": "control.task",
     "ModelError": "errors",

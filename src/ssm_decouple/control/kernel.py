@@ -66,7 +66,9 @@ RATE_SCALE = 9
 RANK = 10  # of J_sub
 RATE_BLEND = 11  # 1, or less where acceleration limits held the rates back
 PLAN_CHANGE = 12  # relative change of the rates in the last pass of planning for a hold; 0 without a plan
-ERRORS = 13  # one a task row, then the smallest singular value of each level, then rho of each level
+EXCESS = 13  # how far acceleration limits were exceeded, relative to them
+LIMITED = 14  # how many bounds the rates stand at, where each limit is kept by itself
+ERRORS = 15  # one a task row, then the smallest singular value of each level, then rho of each level
 
 # Where the scalars stand in `parameters`.
 THRESHOLD = 0
@@ -129,6 +131,8 @@ EPS = 2.220446049250313e-16
 # A row of J_sub below this many rounding errors of J_rc, a metre from the inertial origin, constrains nothing: noise.
 # Of J_base where U_c has linear rows: the velocity of the base origin rounds as J_rc times some metres.
 NOISE = 16.0 * EPS
+# Task rows whose rest is below this share of all are left out of their manipulability: its slope would be rounding.
+DEPENDENT = 1e-9
 # Rates are scaled to just inside the limit, so that no later rounding lifts one above it.
 INSIDE = 1.0 - 8.0 * EPS
 # The same for the change of a rate, which is a difference and so rounds more.
@@ -411,7 +415,7 @@ def bring_within_limits(fixed: Floats, q_dot: Floats, columns: Floats, pace: flo
     factor = 1.0
     for j in range(q_dot.shape[0]):
         way = q_dot[j] - fixed[j]
-        # Not a number for an infinite limit at pace 0: then it limits nothing, and nothing moves.
+        # Not a number for an infinite limit at pace 0: then it limits nothing.
         limit = pace * columns[RATE_LIMIT, j] + (1.0 - pace) * abs(fixed[j])
         if abs(fixed[j] + factor * way) > limit:
             toward = fixed[j] if way > 0.0 else -fixed[j]
@@ -981,6 +985,8 @@ def solve(
                 results[PROTECTED_RATE + i] += U_c[b, i] * drift[source + b, 0]
             for j in range(n):
                 results[PROTECTED_RATE + i] += J_sub[i, j] * q_dot[j]
+    results[EXCESS] = 0.0
+    results[LIMITED] = 0.0
     results[RATE_SCALE] = rate_scale
     results[RATE_BLEND] = blend
     results[RANK] = rank
@@ -992,12 +998,12 @@ def solve(
 def log_manipulability(matrices: Floats, U_c: Floats, columns: Floats, parameters: Floats, count: int) -> float:
     """Return log of the product of the singular values of J_1 N_sub, J_1 being the first `count` task rows.
 
-    Minus infinity at a singularity. Weights of the joints scale the columns, as they do in `solve`.
+    Rows that depend on those before are left out. Weights of the joints scale the columns, as they do in `solve`.
     """
     n, k = columns.shape[1], U_c.shape[1]
     rows, weights, diagonal, order = np.zeros((k + count, n)), np.empty(k + count), np.empty(k), np.zeros(k)
     source = J_PROTECTED if parameters[AXES_JOINT] >= 0.0 else J_BASE
-    square = 0.0
+    square, size = 0.0, 0.0
     for j in range(n):
         for i in range(k):
             for b in range(6):
@@ -1005,14 +1011,19 @@ def log_manipulability(matrices: Floats, U_c: Floats, columns: Floats, parameter
             square += rows[i, j] ** 2
         for r in range(count):
             rows[k + r, j] = columns[SCALE, j] * matrices[J_TASK + r, j]
-    rank = factor_protected_rows(rows, weights, diagonal, order, k, NOISE * np.sqrt(square))
-    if rank + count > n:
-        return -np.inf
+            size += rows[k + r, j] ** 2
+    at = factor_protected_rows(rows, weights, diagonal, order, k, NOISE * np.sqrt(square))
     total = 0.0
     for t in range(count):
-        total += np.log(abs(reflect(rows, weights, k + t, rank + t)))
+        if at == n:
+            break
+        length = abs(reflect(rows, weights, k + t, at))
+        if length <= DEPENDENT * np.sqrt(size):
+            continue
+        total += np.log(length)
         for i in range(k + t + 1, k + count):
-            apply_reflection(rows, weights, k + t, rank + t, rows[i])
+            apply_reflection(rows, weights, k + t, at, rows[i])
+        at += 1
     return total
 
 
@@ -1226,6 +1237,133 @@ def held_command(
     return solve(
         matrices, drift, U_c, tasks, columns, parameters, targets, velocities, previous, out, rates, scratch, small
     )
+
+
+@compiled
+def pose_rows(
+    matrices: Floats,
+    drift: Floats,
+    U_c: Floats,
+    tasks: Floats,
+    columns: Floats,
+    parameters: Floats,
+    velocities: Floats,
+    rates: Floats,
+    results: Floats,
+    rows: Floats,
+    sides: Floats,
+) -> None:
+    """Write the linear equations of the law, for who solves them beside inequalities.
+
+    `rows` (k + m, n) becomes [J_sub; J_1; J_2; ..], each column times SCALE, and `sides` (k + m + 1,) what they shall
+    give, and at the end the length below which a row of J_sub is noise. The tasks' errors stand in `results`.
+    """
+    n, k, m = columns.shape[1], U_c.shape[1], matrices.shape[0] - J_TASK
+    source = J_PROTECTED if parameters[AXES_JOINT] >= 0.0 else J_BASE
+    square, row = 0.0, k
+    for b in range(6):
+        for j in range(n):
+            square += (columns[SCALE, j] * matrices[source + b, j]) ** 2
+    far = 1.0 + abs(results[POSITION]) + abs(results[POSITION + 1]) + abs(results[POSITION + 2])
+    sides[k + m] = NOISE * far * np.sqrt(square)
+    for i in range(k):
+        sides[i] = parameters[WANTED_RATE + i]
+        for b in range(6):
+            sides[i] -= U_c[b, i] * drift[source + b, 0]
+        for j in range(n):
+            rows[i, j] = 0.0
+            for b in range(6):
+                rows[i, j] += columns[SCALE, j] * U_c[b, i] * matrices[source + b, j]
+    for i in range(tasks.shape[0]):
+        task = tasks[i]
+        for r in range(int(task[ROWS])):
+            t = row - k
+            wanted = rates[t] if int(task[KIND]) == LOOKS else velocities[int(task[VELOCITY]) + r]
+            v = parameters[PACE] * (wanted + task[GAIN] * results[ERRORS + t])
+            sides[row] = task[ROOT_WEIGHT] * v - drift[J_TASK + t, 0]
+            for j in range(n):
+                rows[row, j] = columns[SCALE, j] * matrices[J_TASK + t, j]
+            row += 1
+
+
+@compiled_for(
+    f"int64({_FROM_PINOCCHIO}, {_CONSTANTS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_ROWS}, {_ROWS}, "
+    f"{_VECTOR}, {_ROWS}, {_VECTOR})"
+)
+def pose_command(
+    A_g: Floats,
+    J: Floats,
+    placements: Floats,
+    U_c: Floats,
+    tasks: Floats,
+    columns: Floats,
+    parameters: Floats,
+    targets: Floats,
+    velocities: Floats,
+    previous: Floats,
+    out: Floats,
+    q: Floats,
+    matrices: Floats,
+    drift: Floats,
+    rates: Floats,
+    rows: Floats,
+    sides: Floats,
+) -> int:
+    """Do what `selective_command` does, and write what it has solved into the other arrays, by `pose_rows`."""
+    if wrong_size(columns.shape[1], parameters, targets, velocities, previous, out):
+        return WRONG_SIZE
+    read_joints(q, columns)
+    matrices[:] = 0.0
+    drift[:] = 0.0
+    rates[:] = 0.0
+    out[:] = 0.0
+    status = add_matrices(
+        A_g,
+        J,
+        placements,
+        U_c,
+        tasks,
+        columns,
+        parameters,
+        targets,
+        velocities,
+        1.0,
+        matrices,
+        drift,
+        rates,
+        out,
+    )
+    if status != OK:
+        return status
+    status = held_command(matrices, drift, U_c, tasks, columns, parameters, targets, velocities, previous, rates, out)
+    results = out[6 + columns.shape[1] :]
+    pose_rows(matrices, drift, U_c, tasks, columns, parameters, velocities, rates, results, rows, sides)
+    return status
+
+
+@compiled
+def take_rates(
+    matrices: Floats, drift: Floats, U_c: Floats, columns: Floats, parameters: Floats, found: Floats, out: Floats
+) -> None:
+    """Write other joint rates (n,), over SCALE, into a command, and the base twist and protected rate that follow."""
+    n, k = columns.shape[1], U_c.shape[1]
+    source = J_PROTECTED if parameters[AXES_JOINT] >= 0.0 else J_BASE
+    for j in range(n):
+        out[6 + j] = columns[SCALE, j] * found[j]
+    for b in range(6):
+        out[b] = drift[J_BASE + b, 0]
+        for j in range(n):
+            out[b] += matrices[J_BASE + b, j] * out[6 + j]
+    for i in range(k):
+        rate = 0.0
+        for b in range(6):
+            rate += U_c[b, i] * drift[source + b, 0]
+        for j in range(n):
+            J_sub = 0.0
+            for b in range(6):
+                J_sub += U_c[b, i] * matrices[source + b, j]
+            rate += J_sub * out[6 + j]
+        out[6 + n + PROTECTED_RATE + i] = rate
 
 
 @compiled_for(f"int64({_ROWS}, {_ROWS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR}, float64, float64, {_VECTOR})")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,9 +12,12 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
+from ssm_decouple.control.collision import Distances
+from ssm_decouple.control.limits import LimitedRates, LimitedStep, Limits
 from ssm_decouple.control.task import Layout, PositionTask, Task, checked_tasks
 from ssm_decouple.errors import DecoupleWarning, InputError, as_floats
 from ssm_decouple.model.robot import Robot
+from ssm_decouple.momentum.flow import munthe_kaas
 from ssm_decouple.momentum.protection import Protection
 
 Floats = NDArray[np.float64]
@@ -101,6 +104,8 @@ class Command:
     def smallest_singular_value(self) -> float:
         """Smallest singular value of J_gt N_sub: m/s of end-effector per rad/s in the hardest direction.
 
+        With joint weights w the columns are divided by sqrt(w), as they are where the rates are found.
+
         Of other tasks, that of J_1 N_sub, J_1 being the rows of the first level, each times the root of its weight.
         """
         return float(self.smallest_singular_values[0])
@@ -136,6 +141,16 @@ class Command:
     def rate_blend(self) -> float:
         """Share in [0, 1] of the way from the previous rates to the wanted ones that acceleration limits allowed."""
         return float(self._results(kernel.RATE_BLEND)[0])
+
+    @property
+    def acceleration_excess(self) -> float:
+        """Of a law with `limits`: how far acceleration limits are exceeded, relative to them; 0 where they are kept."""
+        return float(self._results(kernel.EXCESS)[0])
+
+    @property
+    def active_limits(self) -> int:
+        """Of a law with `limits`: how many joints stand at one of their bounds; `law.limited` names them."""
+        return int(self._results(kernel.LIMITED)[0])
 
     @property
     def plan_change(self) -> float:
@@ -229,6 +244,10 @@ class SelectiveLaw:
         joint_weights: w of the joints (n,) in the norm sum w_j q_dot_j^2 that the rates minimise, and that damping
             and its threshold act in. None is 1 for all but reaction wheels, which have (r / max_speed)^2, r being the
             largest rate limit of the other joints: a wheel's full speed counts as much as theirs.
+        limits: How limits are kept. None scales the command as a whole, which brakes all joints for one that is at its
+            rate limit, knows no position limits and does not brake ahead. `Limits()` keeps position, rate and
+            acceleration limits and clearances joint by joint, inside null(J_sub), by quadratic programs: the tasks get
+            what is possible beside them, and the arm can always be braked in time.
         momentum: On board (6,), [linear; angular about the centre of mass], kg m/s and kg m2/s, inertial axes; None
             for none. It may be assigned later as `law.momentum`, for example when thrusters have changed it.
         gain: Tracking gain k_p, 1/s, of the tasks that name none.
@@ -245,6 +264,7 @@ class SelectiveLaw:
     Attributes:
         size: Length of the array that `evaluate` fills.
         joint_weights: (n,), as given or by default.
+        limited: Of a law with `limits`, what they did to the last command.
         tasks: The tasks, a tuple.
         layout: Where their rows and targets stand.
 
@@ -267,6 +287,7 @@ class SelectiveLaw:
         tasks: Task | Sequence[Task] | None = None,
         joint_weights: ArrayLike | None = None,
         momentum: ArrayLike | None = None,
+        limits: Limits | None = None,
     ) -> None:
         n = robot.n_joints
         if n == 0:
@@ -277,8 +298,10 @@ class SelectiveLaw:
             raise InputError(f"damping is {damping}; it must be zero or a positive number")
         if not (isinstance(hold_nodes, int) and hold_nodes in GAUSS):
             raise InputError(f"hold_nodes is {hold_nodes}; it is 0 (at the sample), 1, 2 or 3")
-        if sample_time is None and (hold_nodes or acceleration_limit is not None):
-            raise InputError("hold_nodes and acceleration_limit need the sample_time, s, for which a command is held")
+        if sample_time is None and (hold_nodes or acceleration_limit is not None or limits is not None):
+            raise InputError(
+                "hold_nodes, acceleration_limit and limits need the sample_time, s, for which a command is held"
+            )
         self.robot = robot
         self.protection = protection
         self.gain = _positive("gain", gain)
@@ -298,8 +321,13 @@ class SelectiveLaw:
         self.tasks = (PositionTask(),) if tasks is None else checked_tasks(robot, tasks)
         self.layout = Layout(robot, self.tasks, self.gain)
         self.size: int = 6 + n + kernel.ERRORS + self.layout.size + 2 * len(self.layout.level_rows)
+        self.limits = limits
+        self.limited: LimitedRates | None = None
+        self._step: LimitedStep | None = None
         self._prepare()
         self._set_momentum(momentum)
+        if limits is not None:
+            self._prepare_limits(limits)
         if tasks is not None:
             self._refuse_what_nothing_is_left_for()
 
@@ -327,7 +355,9 @@ class SelectiveLaw:
         self._set_momentum(momentum)
 
     def _momentum(self) -> Floats:
-        return self._prepared[3][3][kernel.MOMENTUM :].copy()
+        momentum: Floats = self._prepared[3][3][kernel.MOMENTUM :].copy()
+        momentum.flags.writeable = False
+        return momentum
 
     def _set_momentum(self, momentum: ArrayLike | None) -> None:
         values = np.zeros(6) if momentum is None else as_floats("momentum", momentum)
@@ -426,10 +456,31 @@ class SelectiveLaw:
         self._no_rates: Floats = np.zeros(n)
         self._any_target: Floats = layout.any_target()
         self._J_base: Floats = np.zeros((6, n))
+        self._J_here: Floats = np.zeros((6, n))
         self._matrices: Floats = np.zeros((kernel.J_TASK + layout.size, n))
         self._drift: Floats = np.zeros((kernel.J_TASK + layout.size, 1))
         self._later: Floats = np.zeros(layout.target_sizes[0])
         self._rates: Floats = np.zeros(layout.size)
+
+    def _prepare_limits(self, limits: Limits) -> None:
+        """Let the kernel give rates without limits, to be brought inside them afterwards."""
+        layout, scale = self.layout, 1.0 / np.sqrt(self.joint_weights)
+        _, _, _, (_, _, columns, parameters), _ = self._prepared
+        columns[kernel.RATE_LIMIT], parameters[kernel.LIMITS_STEPS] = np.inf, 0.0
+        accelerations = self.acceleration_limits
+        self._step = LimitedStep(
+            self.robot,
+            replace(limits, position=limits.positions(self.robot) / scale[:, None]),
+            self.rate_limits / scale,
+            None if accelerations is None else accelerations / scale,
+            float(self.sample_time or 0.0),
+        )
+        self._distances = None if limits.clearance is None else Distances(self.robot, limits.clearance)
+        self._scale: Floats | None = None if np.all(scale == 1.0) else scale
+        self._rows: Floats = np.zeros((self._k + layout.size, self._n))
+        self._sides: Floats = np.zeros(self._k + layout.size + 1)
+        self._places = [slice(self._k + rows.start, self._k + rows.stop) for rows in layout.level_rows]
+        self._rhos = [kernel.ERRORS + layout.size + 2 * level + 1 for level in range(len(layout.level_rows))]
 
     def _protected_axes(self) -> tuple[float, Floats]:
         """Return the joint in whose axes the protected directions are fixed, by the kernel's numbers, and U_c there."""
@@ -538,45 +589,64 @@ class SelectiveLaw:
                     self.robot.checked(q)
                 if self._reads_joints:
                     kernel.read_joints(q, constants[2])  # type: ignore[arg-type]
-            status = selective_command(*fixed, target, target_velocity, previous_rates, out)  # type: ignore[arg-type]
+            status = (
+                selective_command(*fixed, target, target_velocity, previous_rates, out)  # type: ignore[arg-type]
+                if self._step is None
+                else self._limited_command(q, target, target_velocity, previous_rates, out)
+            )
         except (TypeError, ValueError):  # a list, another layout, a read-only array or a wrong length
             q = self.robot.checked(q)
             target, target_velocity = self._flat_vectors(target, target_velocity)
             previous_rates = self._checked_rates(previous_rates)
             pin.computeCentroidalMap(model, data, q)
             kernel.read_joints(q, constants[2])
-            status = kernel.selective_command(*fixed, target, target_velocity, previous_rates, self._checked_out(out))
+            out = self._checked_out(out)
+            status = (
+                kernel.selective_command(*fixed, target, target_velocity, previous_rates, out)
+                if self._step is None
+                else self._limited_command(q, target, target_velocity, previous_rates, out)
+            )
         if self.hold_nodes and status == kernel.OK:
             status = self._hold(q, np.asarray(target), np.asarray(target_velocity), np.asarray(previous_rates), out)
         if status:
             self._refuse(q, target, target_velocity, previous_rates, out, status)
 
-    def project(self, q: ArrayLike, joint_rates: Floats, out: Floats, protected_rate: ArrayLike | None = None) -> None:
-        """Bring joint rates to what the protection allows, in the rows for velocity and protected rate of an array.
+    def _limited_command(
+        self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, previous: ArrayLike, out: Floats
+    ) -> int:
+        """Do what `selective_command` does, and bring the rates inside the limits."""
+        fixed, made = self._prepared[4], (self._matrices, self._drift, self._rates, self._rows, self._sides)
+        status = kernel.pose_command(*fixed, target, target_velocity, previous, out, q, *made)  # type: ignore[arg-type]
+        if status == kernel.OK and not self.hold_nodes:
+            self._bring_inside(q, previous, out)  # type: ignore[arg-type]
+        return status
 
-        At the sample, or over the hold where the law plans for that: the nearest rates to the given ones, in the norm
-        of the joint weights, within the rate limits. The tasks have no part in it.
-
-        Args:
-            q: Configuration (nq,).
-            joint_rates: (n,), rad/s or m/s.
-            out: (law.size,); its velocity, protected rate, rank and plan change are overwritten.
-            protected_rate: b (k,), as for the call; None for zero.
-        """
-        _, _, _, (_, _, columns, parameters), _ = self._prepared
-        steps, usual, values = columns[kernel.RATE_STEP].copy(), parameters.copy(), np.empty(self.size)
-        # A blend of nothing with the given rates, in the kernel's words.
-        columns[kernel.RATE_STEP], parameters[kernel.LIMITS_STEPS] = 0.0, 1.0
-        parameters[kernel.PACE : kernel.MOMENTUM] = self._asked(protected_rate, 1.0)
-        targets = self._any_target
-        try:
-            self.evaluate(q, targets, self._at_rest, values, np.ascontiguousarray(joint_rates))
-        finally:
-            columns[kernel.RATE_STEP], parameters[:] = steps, usual
-        start = 6 + self._n
-        out[: start + kernel.POSITION] = values[: start + kernel.POSITION]
-        for kept in (kernel.RANK, kernel.PLAN_CHANGE):
-            out[start + kept] = values[start + kept]
+    def _bring_inside(self, q: ArrayLike, previous: Floats, out: Floats) -> None:
+        """Bring the rates in `out` inside the limits, on the matrices that they were made with."""
+        assert self._step is not None
+        _, _, _, (U_c, _, columns, parameters), _ = self._prepared
+        n, k, rows, sides, scale = self._n, self._k, self._rows, self._sides, self._scale
+        results, positions = out[6 + n :], columns[kernel.JOINT_POSITION]
+        apart, distances = (None, None) if self._distances is None else self._distances(np.asarray(q))
+        plain = out[6 : 6 + n]
+        if scale is not None:
+            positions, previous, plain = positions / scale, previous / scale, plain / scale
+            apart = None if apart is None else apart * scale
+        levels = [
+            (rows[place], sides[place], float(results[rho]))
+            for place, rho in zip(self._places, self._rhos, strict=True)
+        ]
+        self.limited = self._step(
+            positions, previous, plain, rows[:k], sides[:k], levels, apart, distances, float(sides[-1])
+        )
+        found = self.limited.joint_rates
+        if found is plain:
+            return
+        if scale is not None:  # take out what the rounding of the scaling leaves in the protected rows
+            J_sub = rows[:k] / scale
+            found = found - np.linalg.pinv(rows[:k]) @ (J_sub @ (scale * found) - self.limited.share * sides[:k])
+        kernel.take_rates(self._matrices, self._drift, U_c, columns, parameters, found, out)
+        results[kernel.EXCESS], results[kernel.LIMITED] = self.limited.excess, self.limited.count
 
     def base_twist(self, q: Floats, joint_rates: Floats) -> Floats:
         """Return the base twist (6,), base axes, that joint rates (n,) and the momentum on board cause at q.
@@ -598,11 +668,9 @@ class SelectiveLaw:
         Raises:
             InputError: q has the wrong length or is not finite.
         """
-        checked = self.robot.checked(q)
-        J, J_sub = (
-            self._task_jacobian(checked)[self.layout.level_rows[0]],
-            self.protection.J_sub(self.robot.coupling(checked)),
-        )
+        checked, scale = self.robot.checked(q), 1.0 / np.sqrt(self.joint_weights)
+        J = scale * self._task_jacobian(checked)[self.layout.level_rows[0]]
+        J_sub = scale * self.protection.J_sub(self.robot.coupling(checked))
 
         def left_by(rows: Floats) -> Floats:
             return J - (J @ np.linalg.pinv(rows)) @ rows if len(rows) else J
@@ -620,9 +688,9 @@ class SelectiveLaw:
         """
         model, _, views, (_, tasks, columns, parameters), _ = self._prepared
         velocity, results = out[: model.nv], out[model.nv :]
-        kernel.base_twist_map(views[0], self._J_base)  # at the sample, as is the base twist that the command tells
+        kernel.base_twist_map(views[0], self._J_here)  # at the sample, as is the base twist that the command tells
         errors = results[kernel.ERRORS :][: self.layout.size]
-        self._base_drift = out[:6] - self._J_base @ velocity[6:]
+        self._base_drift = out[:6] - self._J_here @ velocity[6:]
         kept_position, kept_errors = results[kernel.POSITION :][:3].copy(), errors.copy()
         kernel.advance_targets(tasks, target, target_velocity, 0.5 * float(self.sample_time or 0.0), self._later)
         status, change = self._plan(q, (columns, parameters), target_velocity, previous, out)
@@ -651,7 +719,7 @@ class SelectiveLaw:
             for total in (matrices, drift, rates, position, errors):
                 total[:] = 0.0
             for node, weight in GAUSS[self.hold_nodes]:
-                moved = pin.integrate(model, q, node * hold * velocity)
+                moved = self._after(q, velocity, node * hold)
                 pin.computeCentroidalMap(model, data, moved)
                 if self._reads_joints:
                     kernel.read_joints(moved, columns)
@@ -659,11 +727,31 @@ class SelectiveLaw:
             status = status or kernel.held_command(
                 matrices, drift, U_c, tasks, *settings, targets, velocities, previous, rates, out
             )
-            velocity[:6] = self._J_base @ velocity[6:] + self._base_drift
+            if self._step is not None and status == kernel.OK:
+                kernel.pose_rows(
+                    matrices, drift, U_c, tasks, *settings, velocities, rates, results, self._rows, self._sides
+                )
+                self._bring_inside(q, previous, out)
+            velocity[:6] = self._J_here @ velocity[6:] + self._base_drift
             change = kernel.change_of(velocity[6:], before)
             if status != kernel.OK or change <= CONVERGED:
                 break
         return status, change
+
+    def _after(self, q: ArrayLike, velocity: Floats, time: float) -> Floats:
+        """Return where joint rates that are held lead.
+
+        Without momentum no matrix depends on where the base is, so that its first twist will do.
+        """
+        if not self._prepared[3][3][kernel.MOMENTUM :].any():
+            return pin.integrate(self.robot.model, q, time * velocity)
+        rates = velocity[6:]
+        start = np.asarray(q)
+
+        def drifting(at: Floats, _: float) -> Floats:
+            return np.r_[self.base_twist(at, rates), rates]
+
+        return munthe_kaas(self.robot.model, start, drifting(start, 0.0), time, drifting)[0]
 
     def _flat_vectors(self, target: ArrayLike, velocity: ArrayLike) -> tuple[Floats, Floats]:
         if self._flat:
@@ -739,6 +827,7 @@ class SelectiveLaw:
             "sample_time": self.sample_time,
             "hold_nodes": self.hold_nodes,
             "acceleration_limits": None if limits is None else limits.tolist(),
+            "limits": None if self.limits is None else self.limits.describe(self.robot),
         }
 
 

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import Command, LostDirection, SelectiveLaw
+from ssm_decouple.control.task import Piece, Task
 from ssm_decouple.errors import InputError, as_floats, as_positive
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
@@ -17,6 +19,14 @@ from ssm_decouple.momentum.protection import Protection
 Floats = NDArray[np.float64]
 Progress = Callable[[float, Floats], float]
 
+_OF_THE_BRIDGE: tuple[int | slice, ...] = (  # what a hand-over's results are, of those that stand in `out`
+    slice(kernel.PROTECTED_RATE, kernel.PROTECTED_RATE + 6),
+    kernel.RANK,
+    kernel.RATE_BLEND,
+    kernel.PLAN_CHANGE,
+    kernel.EXCESS,
+    kernel.LIMITED,
+)
 SHARED = 1e-12  # how far from 1 the cosine between two subspaces may be for a direction to count as in both
 
 
@@ -60,6 +70,10 @@ class Schedule:
             raise InputError("a schedule needs either hand_over, s, for protections with times, or progress(time, q)")
         self._starts: Floats = np.zeros(0)
         self._hand_over, self._progress = 1.0, progress
+        if progress is not None and not callable(progress):
+            raise InputError(f"progress is {progress!r}; it must be a function of time, s, and configuration")
+        if isinstance(protections, str) or not isinstance(protections, Sequence):
+            raise InputError(f"protections is {protections!r}; a schedule needs a list of two or more")
         given = list(protections)
         if hand_over is not None:
             self._hand_over = as_positive("hand_over", hand_over)
@@ -67,10 +81,10 @@ class Schedule:
         self.protections = tuple(p if isinstance(p, Protection) else Protection(p) for p in given)
         if len(self.protections) < 2:
             raise InputError(f"a schedule needs two or more protections, not {len(self.protections)}")
-        frames = [protection.frame for protection in self.protections]
-        if len(set(frames)) > 1:
+        frames = list(dict.fromkeys(protection.frame for protection in self.protections if protection.k))
+        if len(frames) > 1:
             raise InputError(f"the protections of a schedule need the same frame, not {', '.join(frames)}")
-        self.frame = frames[0]
+        self.frame = frames[0] if frames else "base"
         found: list[Floats] = []
         self.rows = tuple([_place(found, column) for column in p.U_twist.T] for p in self.protections)
         self.U_twist: Floats = np.array(found).reshape(-1, 6).T
@@ -100,14 +114,17 @@ class Schedule:
             InputError: `progress` is not in [0, protections - 1].
         """
         last = len(self.protections) - 1
+        if not np.isfinite(time):
+            raise InputError(f"time is {time}; a schedule needs a finite one, s")
         if self._progress is None:
             entering = int(np.searchsorted(self._starts[1:], time, side="right"))  # how many have begun to enter
             way = (time - self._starts[entering]) / self._hand_over if entering else 1.0
             place = entering if way >= 1.0 else entering - 1 + way
         else:
-            place = float(self._progress(time, q))
+            told = as_floats("progress(time, q) of a schedule", self._progress(time, q))
+            place = float(told) if told.shape == () else np.nan
             if not 0.0 <= place <= last:
-                raise InputError(f"progress(time, q) of a schedule is {place} at {time:g} s; it is from 0 to {last}")
+                raise InputError(f"progress(time, q) of a schedule is {told} at {time:g} s; it is from 0 to {last}")
         number = min(int(place), last)
         x = place - number
         return number, x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
@@ -150,6 +167,28 @@ def _place(found: list[Floats], column: Floats) -> int:
     return len(found) - 1
 
 
+@dataclass(frozen=True)
+class _GivenRates(Task):
+    """Joint rates as near to given ones, its target's velocity (n,), as the protection lets them be."""
+
+    gain: float | None = None
+    weight: float = 1.0
+    level: int = 1
+    takes_target: ClassVar[bool] = False
+
+    def pieces(self, robot: Robot) -> list[Piece]:
+        return [Piece(kernel.CLIMBS, robot.joint_names, np.arange(1.0, robot.n_joints + 1))]
+
+    def flat_target(self, robot: Robot, target: Any) -> Floats:
+        return np.zeros(0)
+
+    def sizes(self, robot: Robot) -> tuple[int, int]:
+        return 0, robot.n_joints
+
+    def owner(self, robot: Robot) -> str:
+        return "joint"
+
+
 class ScheduledLaw(SelectiveLaw):
     """The selective law under a schedule of protections.
 
@@ -178,9 +217,17 @@ class ScheduledLaw(SelectiveLaw):
         super().__init__(robot, schedule.protections[0], **settings)
         self.schedule = schedule
         self.phases = tuple(SelectiveLaw(robot, protection, **settings) for protection in schedule.protections)
+        # In a hand-over the limits on changes are kept once, by the bridge: two laws that both start from the rates
+        # commanded before would each keep part of what the other has changed.
+        free = {name: value for name, value in settings.items() if name not in ("acceleration_limit", "limits")}
+        self._free = self.phases
+        if len(free) < len(settings):
+            self._free = tuple(SelectiveLaw(robot, protection, **free) for protection in schedule.protections)
+        follow = {**settings, "tasks": _GivenRates(), "damping": 0.0}
         count = len(self.phases) - 1
-        self._bridges = tuple(SelectiveLaw(robot, schedule.shared(i), **settings) for i in range(count))
+        self._bridges = tuple(SelectiveLaw(robot, schedule.shared(i), **follow) for i in range(count))
         self._first, self._second = np.empty(self.size), np.empty(self.size)
+        self._bridged = np.empty(self._bridges[0].size)
         self.momentum = self.momentum
 
     @property
@@ -210,8 +257,9 @@ class ScheduledLaw(SelectiveLaw):
     @momentum.setter
     def momentum(self, momentum: ArrayLike | None) -> None:
         self._set_momentum(momentum)
-        for law in (*self.phases, *getattr(self, "_bridges", ())):
-            law.momentum = self._momentum()
+        if self.phases:  # not while the first of them is made
+            for law in (*self.phases, *self._free, *self._bridges):
+                law.momentum = self._momentum()
 
     def __call__(
         self,
@@ -234,7 +282,7 @@ class ScheduledLaw(SelectiveLaw):
         targets = self.layout.flat_targets(target)
         velocities = self.layout.flat_velocities(target_velocity)
         self.evaluate(q, targets, velocities, values, previous_rates, protected_rate, pace, time)
-        number, share = self.schedule.at(time, self.robot.checked(q))
+        number, share = self.schedule.at(time, np.asarray(q))
         current = self.phases[number] if share == 0.0 else self._bridges[number]
         return Command(values, self._n, current.protection.k, self.layout)
 
@@ -255,26 +303,31 @@ class ScheduledLaw(SelectiveLaw):
             InputError: as for the call.
         """
         wanted = self._rows_of_each(protected_rate)
-        number, share = self.schedule.at(time, self.robot.checked(q))
+        number, share = self.schedule.at(time, np.asarray(q))
         if share == 0.0:
-            self.phases[number].evaluate(q, target, target_velocity, out, previous_rates, wanted[number], pace, time)
+            self.phases[number].evaluate(q, target, target_velocity, out, previous_rates, wanted[number], pace)
             return
+        self._checked_out(out)
         for phase, values in ((number, self._first), (number + 1, self._second)):
-            self.phases[phase].evaluate(q, target, target_velocity, values, previous_rates, wanted[phase], pace, time)
-        n, first, second = self._n, self._first, self._second
+            self._free[phase].evaluate(q, target, target_velocity, values, previous_rates, wanted[phase], pace)
+        n, first, second, bridged = self._n, self._first, self._second, self._bridged
+        rates, bridge = first[6 : 6 + n] + share * (second[6 : 6 + n] - first[6 : 6 + n]), self._bridges[number]
+        asked = None if protected_rate is None else self._bridge(number, wanted)
+        bridge.evaluate(q, np.zeros(0), rates, bridged, previous_rates, asked)
         out[:] = first if share < 0.5 else second
-        rates = first[6 : 6 + n] + share * (second[6 : 6 + n] - first[6 : 6 + n])
-        results, scale = out[6 + n :], 6 + n + kernel.RATE_SCALE
-        self._bridges[number].project(q, rates, out, None if protected_rate is None else self._bridge(number, wanted))
-        results[kernel.RATE_SCALE] = min(first[scale], second[scale])
+        out[: 6 + n] = bridged[: 6 + n]
+        for kept in _OF_THE_BRIDGE:
+            out[6 + n :][kept] = bridged[6 + n :][kept]
+        out[6 + n + kernel.RATE_SCALE] = min(part[6 + n + kernel.RATE_SCALE] for part in (first, second, bridged))
+        self.limited = bridge.limited
 
     def _rows_of_each(self, protected_rate: ArrayLike | None) -> list[Floats | None]:
         if protected_rate is None:
             return [None] * len(self.phases)
         rate = as_floats("protected_rate", protected_rate)
-        if rate.shape != (self.schedule.k,):
+        if rate.shape != (self.schedule.k,) or not np.all(np.isfinite(rate)):
             raise InputError(
-                f"protected_rate has shape {rate.shape}; it needs {self.schedule.k} numbers, one a direction of the "
+                f"protected_rate is {rate.tolist()}; it needs {self.schedule.k} finite numbers, one a direction of the "
                 "schedule"
             )
         return [rate[rows] for rows in self.schedule.rows]
@@ -287,4 +340,5 @@ class ScheduledLaw(SelectiveLaw):
 
     def describe(self) -> dict[str, Any]:
         """Return the law's settings in plain types, for a record."""
-        return {**super().describe(), "U_c": self.schedule.U_twist.tolist(), "schedule": self.schedule.settings()}
+        told = {"U_c": self.schedule.U_twist.tolist(), "frame": self.schedule.frame, "k": self.schedule.k}
+        return {**super().describe(), **told, "schedule": self.schedule.settings()}

@@ -222,6 +222,11 @@ class RelativePoseTask(Task):
         joint, pose, moves = _on_arm(robot, self.frame)
         holder, reference, carried = _on_arm(robot, self.reference)
         moves = moves - carried
+        if 0 in (joint, holder):
+            raise InputError(
+                f"a relative pose task has frames of the robot, not '{self.frame if joint == 0 else self.reference}', "
+                "which is inertial; use a PoseTask for a pose in inertial axes"
+            )
         return [
             Piece(kernel.POINTS, ("x", "y", "z"), moves, joint, *_split(pose), 3, 4, 0, holder, reference),
             Piece(kernel.TURNS, ("rx", "ry", "rz"), moves, joint, *_split(pose), 0, 4, 3, holder, reference),
@@ -407,7 +412,7 @@ class Layout:
                 lines.append(_line(piece, level, gain if task.gain is None else task.gain, task.weight, place))
                 moves.append(piece.moves)
                 tool = piece.kind == kernel.POINTS and task.owner(robot) == robot.end_effector
-                if piece.kind == kernel.CLIMBS:
+                if isinstance(task, ManipulabilityTask):
                     self.climbs = slice(place[1], place[1] + robot.n_joints), float(lines[-1][kernel.GAIN])
                 if tool and self.tool_position is None:
                     start, stride = place[0] + piece.target, piece.stride
@@ -561,8 +566,13 @@ def checked_tasks(robot: Robot, tasks: Task | Sequence[Task]) -> tuple[Task, ...
             )
     if sum(isinstance(task, ManipulabilityTask) for task in given) > 1:
         raise InputError("there are two manipulability tasks, which ask for the same; drop one")
-    if not any(task.level == 1 or task.takes_target for task in given):
-        raise InputError("a manipulability task needs another task to serve: add one, such as PositionTask()")
+    served = [task.level for task in given if not isinstance(task, ManipulabilityTask)]
+    for task in given:
+        if isinstance(task, ManipulabilityTask) and not (served and min(served) < task.level):
+            raise InputError(
+                f"a manipulability task of level {task.level} needs a task of a level before its own to serve; add "
+                "one, such as PositionTask()"
+            )
     return given
 
 

@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, as_floats
 from ssm_decouple.model.appendage import Appendage, Modes, checked_appendages, inspect_remaining_bus
+from ssm_decouple.model.locked import locked_urdf
 from ssm_decouple.model.payload import loaded_urdf, payload_body
 from ssm_decouple.model.urdf import inspect_urdf, parse_urdf, root_link, tip_links
 from ssm_decouple.model.wheels import Wheel, wheel_axes, wheeled_urdf
@@ -161,6 +162,26 @@ class Robot:
             raise type(error)(f"robot '{self.name}': {error}") from error
         text, name = ET.tostring(whole, encoding="unicode"), f"{self.name} + wheels"
         return Robot(text, name=name, end_effector=self.end_effector, appendages=self.appendages)
+
+    def with_locked(self, joints: Mapping[str, float]) -> Robot:
+        """Return this robot with joints fixed where they stand: failed, braked, or not to be used.
+
+        They are fixed joints of the new robot's URDF, so that configurations and joint rates have no entry for them:
+        build configurations by joint name. The others keep their order, and end-effector, limits, appendages and
+        wheels stay. With every joint locked what is left is a rigid spacecraft; with none, the robot as it is.
+
+        Args:
+            joints: Joint name to position, rad or m; within its limits or not.
+
+        Raises:
+            InputError: an unknown joint (the nearest known one is named), or a position that is not finite.
+        """
+        try:
+            whole = locked_urdf(parse_urdf(self.urdf, self.name), joints, self.joint_names)
+        except InputError as error:
+            raise InputError(f"robot '{self.name}': {error}") from error
+        listed = ", ".join(joints) if len(joints) < 4 else f"{len(joints)} joints"
+        return self._rebuilt(whole, f"{self.name}, {listed} locked" if joints else self.name)
 
     def _rebuilt(self, root: ET.Element, name: str) -> Robot:
         """Return a robot of a changed URDF, without telling once more of inertias that this one has told of."""

@@ -103,7 +103,7 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
         ("time", "axis"),
         "m",
         "inertial",
-        "audit: centre of mass of the whole, at rest if all is right",
+        "audit: centre of mass of the whole; if all is right at rest, or as the linear momentum moves it",
     ),
     "U_c": (
         ("twist", "protected"),
@@ -276,7 +276,7 @@ def build_motion(
         variables["task_error"] = xr.Variable(("time", "task_row"), errors, _TASK_ERROR, fastpath=True)
         coordinates |= {"task_row": list(layout.row_names), "task_level": ("task_row", np.array(layout.row_levels))}
     if shares is not None:
-        variables["protected_share"] = xr.Variable(("time", "protected"), shares, _SHARE, fastpath=True)
+        variables["protection_share"] = xr.Variable(("time", "protected"), shares, _SHARE, fastpath=True)
     attributes = _attributes(law)
     if robot.wheel_names:
         stored, spans = _wheels(law, time, values)

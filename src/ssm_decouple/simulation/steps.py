@@ -12,6 +12,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.control.law import GAUSS, SelectiveLaw
+from ssm_decouple.momentum.flow import munthe_kaas
 
 Floats = NDArray[np.float64]
 Reference = Callable[[float], tuple[Floats, Floats]]  # time to target position and velocity
@@ -44,7 +45,7 @@ def held(
     model, h = law.robot.model, t_next - t
     rates = values[6 : model.nv]
     if law.momentum.any():
-        return _munthe_kaas(model, q, values[: model.nv], h, lambda x, _: np.r_[law.base_twist(x, rates), rates])
+        return munthe_kaas(model, q, values[: model.nv], h, lambda x, _: np.r_[law.base_twist(x, rates), rates])
     turning = np.r_[np.zeros(6), rates]
 
     def twist(node: float) -> Floats:
@@ -70,35 +71,7 @@ def runge_kutta(
         law.evaluate(stage, *reference(t + ahead), buffer, pace=pace(t + ahead), time=t + ahead)
         return buffer[: model.nv].copy()
 
-    return _munthe_kaas(model, q, values[: model.nv], t_next - t, velocity)
-
-
-def _munthe_kaas(
-    model: pin.Model, q: Floats, start: Floats, h: float, velocity: Callable[[Floats, float], Floats]
-) -> tuple[Floats, Floats]:
-    """Take a step of the classical fourth order in the coordinates u = difference(q, .) about the step's start.
-
-    There u_dot = d(difference)/dq v, which carries the curvature of SE(3) exactly.
-
-    Args:
-        model: Pinocchio's.
-        q: Configuration at the start (nq,).
-        start: Velocity there (nv,).
-        h: Length of the step, s.
-        velocity: Of a configuration and the time since the start, s.
-    """
-
-    def slope(u: Floats, ahead: float) -> tuple[Floats, Floats]:
-        stage = pin.integrate(model, q, u)
-        v = velocity(stage, ahead)
-        return pin.dDifference(model, q, stage, pin.ARG1) @ v, v[:6]
-
-    u1, t1 = start, start[:6]
-    u2, t2 = slope(0.5 * h * u1, 0.5 * h)
-    u3, t3 = slope(0.5 * h * u2, 0.5 * h)
-    u4, t4 = slope(h * u3, h)
-    moved = (h / 6.0) * (t1 + 2.0 * t2 + 2.0 * t3 + t4)
-    return pin.integrate(model, q, (h / 6.0) * (u1 + 2.0 * u2 + 2.0 * u3 + u4)), moved
+    return munthe_kaas(model, q, values[: model.nv], t_next - t, velocity)
 
 
 STEPS: dict[str, Step] = {"explicit": explicit, "held": held, "rk4": runge_kutta}

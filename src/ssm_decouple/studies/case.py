@@ -17,7 +17,9 @@ import pinocchio as pin
 import xarray as xr
 from numpy.typing import NDArray
 
+from ssm_decouple.control.collision import Clearance
 from ssm_decouple.control.law import SelectiveLaw
+from ssm_decouple.control.limits import Limits
 from ssm_decouple.control.schedule import Schedule, ScheduledLaw
 from ssm_decouple.control.task import (
     BoresightTask,
@@ -87,6 +89,7 @@ _SCHEMA: dict[str, dict[str, tuple[str, bool]]] = {
         "acceleration_limit": (_NUMBER, False),
         "joint_weights": (_LIST, False),
     },
+    "limits": {"braking": (_NUMBER, False), "clearance": (_NUMBER, False)},
     "simulation": {
         "duration": (_NUMBER, True),
         "dt": (_NUMBER, True),
@@ -137,7 +140,7 @@ class Case:
         target: Desired end-effector position (3,), m, inertial axes, or what the law's tasks take.
         protection: The case's own protection, or a schedule of several.
         law: Further arguments of `SelectiveLaw`: gain, rate_limit, damping, damping_threshold, hold_nodes,
-            acceleration_limit, tasks, joint_weights, momentum. The law's sample time is `dt`.
+            acceleration_limit, tasks, joint_weights, momentum, limits. The law's sample time is `dt`.
         duration: s.
         dt: Time between samples, s.
         simulation: Further arguments of `simulate`: method, arrival_tolerance, smooth_start.
@@ -186,7 +189,7 @@ class Case:
     def make_law(self, protection: Protection | Schedule | None = None, dt: float | None = None) -> SelectiveLaw:
         """Return the case's law, with another protection or time between samples than its own if one is given."""
         step = self.dt if dt is None else dt
-        planned = "hold_nodes" in self.law or "acceleration_limit" in self.law
+        planned = bool(self.law.keys() & {"hold_nodes", "acceleration_limit", "limits"})
         chosen, sample_time = protection or self.protection, step if planned else None
         if isinstance(chosen, Schedule):
             return ScheduledLaw(self.robot, chosen, sample_time=sample_time, **self.law)
@@ -277,6 +280,8 @@ def _case(content: dict[str, Any], path: Path) -> Case:
         law_arguments["momentum"] = [
             float(x) for part in ("linear", "angular") for x in start.get(f"{part}_momentum", (0, 0, 0))
         ]
+    if "limits" in content:
+        law_arguments["limits"] = _limits(content["limits"])
     tasks, target = _tasks(content)
     if tasks:
         law_arguments["tasks"] = tasks
@@ -300,6 +305,11 @@ def _case(content: dict[str, Any], path: Path) -> Case:
             for name, angle in content.get("spacecraft", {}).get("turned_deg", {}).items()
         },
     )
+
+
+def _limits(given: Mapping[str, Any]) -> Limits:
+    clearance = {"clearance": Clearance(given["clearance"])} if "clearance" in given else {}
+    return Limits(**{key: value for key, value in given.items() if key != "clearance"}, **clearance)
 
 
 def _protection(given: Mapping[str, Any]) -> Protection | Schedule:

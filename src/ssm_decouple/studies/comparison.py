@@ -49,7 +49,8 @@ class Summary:
         rate_limited_share: Share of the samples in which the rates were scaled down to the limits.
         joint_travel_deg: Joint rates' norm integrated over time.
         acceleration_max_deg_s2: Largest change of a joint rate from sample to sample, from rest on, over dt.
-        centre_of_mass_drift_m: How far the centre of mass wandered: the integrator's error, zero in physics.
+        centre_of_mass_drift_m: How far the centre of mass wandered from where the linear momentum takes it: the
+            integrator's error, zero in physics.
         saturated: In a dynamic simulation, from when to when, s, a drive stood at its torque limit.
         lost: Of a stalled motion the direction that its tasks could move least at the end, and what took it, in words.
     """
@@ -94,6 +95,7 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
     rates = motion.joint_rates.values
     changes = np.diff(np.vstack([np.zeros_like(rates[:1]), rates[:-1]]), axis=0)
     drift = motion.centre_of_mass.values - motion.centre_of_mass.values[0]
+    drift = drift - np.outer(time - time[0], _linear_velocity(motion))
     x, y, z = (float(value) for value in motion.end_effector_position.values[-1])
     return Summary(
         case=motion.attrs["case"],
@@ -120,6 +122,12 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         saturated=tuple((start, end) for start, end in json.loads(motion.attrs.get("saturated", "[]"))),
         lost=lost_direction(motion),
     )
+
+
+def _linear_velocity(motion: xr.Dataset) -> np.ndarray[Any, Any]:
+    """Return the velocity of the centre of mass (3,), m/s, that the momentum on board means."""
+    momentum = np.array(json.loads(motion.attrs["law"])["momentum"][:3])
+    return momentum / robot_of(motion).mass if momentum.any() else momentum
 
 
 def lost_direction(motion: xr.Dataset) -> str:
@@ -160,9 +168,9 @@ def _while_on(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[Any,
     The angle of a direction is counted from when it came to be.
     """
     rate, angle = motion.protected_rate.values, motion.protected_angle.values
-    if "protected_share" not in motion:
+    if "protection_share" not in motion:
         return rate, angle
-    on = motion.protected_share.values == 1.0
+    on = motion.protection_share.values == 1.0
     rate, angle = np.where(on, rate, 0.0), angle.copy()
     for i in range(on.shape[1]):
         begun = np.flatnonzero(on[:, i] & ~np.r_[False, on[:-1, i]])

@@ -87,7 +87,7 @@ def protected_rate(motion: xr.Dataset) -> Figure:
         axes.plot(
             motion.time,
             rates[:, i] / 10.0**exponent,
-            color=(PROTECTED, "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9")[i],
+            color=(PROTECTED, "#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9")[i % 6],
             linewidth=0.6,
             label=f"{'along' if linear else 'about'} ({column})",
         )

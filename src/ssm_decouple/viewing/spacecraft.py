@@ -79,8 +79,7 @@ def _draw_motion(axes: Axes3D, motion: xr.Dataset, robot: Robot, q: Floats) -> N
     U_c = motion.U_c.values
     # A line is an axis of rotation; a direction with a linear part is none.
     directions = U_c[3:, ~np.any(U_c[:3], axis=0)]
-    if json.loads(motion.attrs["law"])["frame"] == "base":
-        directions = pose.rotation @ directions
+    directions = robot.coupling(q).inertial().rotation_of(json.loads(motion.attrs["law"])["frame"]) @ directions
     for i, direction in enumerate(directions.T):
         name = "protected axis $U_c$" if directions.shape[1] == 1 else "protected axes $U_c$"
         label = name if i == 0 else None
