@@ -75,6 +75,19 @@ def every_limit(rng: np.random.Generator, robot: ssm.Robot) -> Trial:
     return limited, q, target, {"previous_rates": rng.uniform(-0.05, 0.05, robot.n_joints)}
 
 
+def joint_by_joint(rng: np.random.Generator, robot: ssm.Robot) -> Trial:
+    """Return a law that keeps position, rate and acceleration limits by quadratic programs, all of them acting."""
+    law, q, target, _ = anywhere(rng, robot)
+    positions = robot.joint_positions(q)
+    room = rng.uniform(1e-4, 0.2, size=(robot.n_joints, 2))
+    limits = ssm.Limits(position=np.column_stack([positions - room[:, 0], positions + room[:, 1]]))
+    limited = ssm.SelectiveLaw(
+        robot, law.protection, rate_limit=0.05, acceleration_limit=0.05, sample_time=0.1, tasks=law.tasks, limits=limits
+    )
+    slow = limited(q, target, previous_rates=np.zeros(robot.n_joints)).joint_rates
+    return limited, q, target, {"previous_rates": rng.uniform(0.0, 2.0) * slow}
+
+
 def near_singular(rng: np.random.Generator, robot: ssm.Robot) -> Trial | None:
     """Return a position law within NEAR of where J_gt N_sub is singular: one freedom for each row of both."""
     k = robot.n_joints - 3
@@ -142,7 +155,8 @@ def main(count: int) -> None:
     warnings.simplefilter("ignore", ssm.DecoupleWarning)  # of tasks that nothing is left for: that is meant here
     kinds = {
         "random tasks, weights and limits": anywhere,
-        "every limit active": every_limit,
+        "every limit active, as a whole": every_limit,
+        "every limit active, joint by joint": joint_by_joint,
         f"within {NEAR:g} rad of singular": near_singular,
     }
     print(f"{'states':<40} {'number':>7} {'median':>8} {'worst':>8}   |J_sub q_dot| / (eps |J_sub| |q_dot|)")

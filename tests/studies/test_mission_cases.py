@@ -39,7 +39,7 @@ phases = [{ from = 0, axes = "none" }, { from = 0.5, axes = [[0, 0, 1]] }]
 hand_over = 0.2
 [law]
 joint_weights = [1, 1, 1, 2, 2, 2]
-acceleration_limit = 0.02
+acceleration_limit = 0.2
 [limits]
 braking = 0.7
 [simulation]

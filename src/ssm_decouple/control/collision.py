@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import product
+from typing import Any, NamedTuple
 
 import coal
 import numpy as np
@@ -19,10 +20,9 @@ Pair = tuple[str, str]
 # Coal's default of 1e-6 leaves the normal, and so the rates, three digits. Of how deep bodies are in each other it is
 # left: there a smaller one fails.
 TOLERANCE = 1e-8
-NEARLY = 0.1
-NEARLY_PARALLEL_BELOW = 0.5
-POINT = coal.Sphere(0.0)
-CORNERS = np.array(list(product((-1.0, 1.0), repeat=3)))
+NEARLY = 0.1  # m: corners and ends this much farther than the nearest points are looked at too
+CLOSE = 0.5  # m beyond the clearance: pairs farther apart have no other row than that of their nearest points
+POINT, EYE = coal.Sphere(0.0), np.eye(3)
 
 
 @dataclass(frozen=True)
@@ -87,8 +87,8 @@ class Distances:
             for name in pair:
                 if name not in links:
                     raise InputError(
-                        f"link '{name}' of the pair {tuple(pair)} has no collision shape in '{robot.name}'; those with one: "
-                        f"{', '.join(dict.fromkeys(links))}"
+                        f"link '{name}' of the pair {tuple(pair)} has no collision shape in '{robot.name}'; those with "
+                        f"one: {', '.join(dict.fromkeys(links))}"
                     )
         chosen = list(self._chosen(links))
         if not chosen:
@@ -101,6 +101,7 @@ class Distances:
         self.names: tuple[Pair, ...] = tuple((links[first], links[second]) for first, second in chosen)
         self._data = robot.model.createData()
         self._results = self._geometry.createData()
+        self._candidates = _Candidates.of(self._geometry)
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
         self._request.gjk_tolerance = TOLERANCE
         for request in self._results.distanceRequests:
@@ -115,27 +116,21 @@ class Distances:
 
     def _chosen(self, links: list[str]) -> Iterator[tuple[int, int]]:
         """Yield the pairs of shapes, by their places."""
-        shapes, parents = self._geometry.geometryObjects, self.robot.model.parents
+        joints, parents = [shape.parentJoint for shape in self._geometry.geometryObjects], self.robot.model.parents
         wanted = None if self.clearance.pairs is None else {frozenset(pair) for pair in self.clearance.pairs}
         ignored = {frozenset(pair) for pair in self.clearance.ignored}
-        for second in range(len(shapes)):
+        for second in range(len(links)):
             for first in range(second):
-                pair, (a, b) = (
-                    frozenset((links[first], links[second])),
-                    (
-                        shapes[first].parentJoint,
-                        shapes[second].parentJoint,
-                    ),
-                )
+                a, b, pair = joints[first], joints[second], frozenset((links[first], links[second]))
                 if a == b or pair in ignored:
                     continue
-                if pair in wanted if wanted is not None else a not in (b, parents[b]) and b != parents[a]:
+                if pair in wanted if wanted is not None else a != parents[b] and b != parents[a]:
                     yield first, second
 
-    def __call__(self, q: Floats) -> tuple[Floats, Floats]:
-        """Return the rates of the distances per joint rate (c, n) and the distances (c,), m.
+    def __call__(self, q: Floats) -> tuple[Floats, Floats, NDArray[np.int64]]:
+        """Return rates of distances per joint rate (c, n), the distances (c,), m, and of which of `names` each is (c,).
 
-        A distance is negative where bodies are in each other: how deep.
+        First those of all pairs, then those of ends. A distance is negative where bodies are in each other: how deep.
 
         Args:
             q: Configuration (nq,).
@@ -144,49 +139,50 @@ class Distances:
         J = pin.computeJointJacobians(model, self._data, q)[:, 6:]
         pin.updateGeometryPlacements(model, self._data, geometry, results)
         pin.computeDistances(geometry, results)
-        found = results.distanceResults
-        distances = np.array([result.min_distance for result in found])
-        normals = np.array([result.normal for result in found])
-        first = np.array([result.getNearestPoint1() for result in found])
-        second = np.array([result.getNearestPoint2() for result in found])
-        sides = [np.arange(len(found))]
-        ends = self._ends(distances, normals)
+        near = _Nearest.of([(i, *_numbers(result)) for i, result in enumerate(results.distanceResults)])
+        ends = self._ends(near)
         if ends:
-            sides.append(np.array([end[0] for end in ends]))
-            distances = np.r_[distances, [end[1] for end in ends]]
-            normals, first, second = (
-                np.vstack([values, [end[i] for end in ends]]) for i, values in ((2, normals), (3, first), (4, second))
-            )
-        pairs = np.concatenate(sides)
-        rows = _rates(J, normals, second, self._carry_second[pairs]) - _rates(
-            J, normals, first, self._carry_first[pairs]
-        )
+            near = _Nearest.of([*zip(*near, strict=True), *ends])
         if self.clearance.horizon is not None:
-            near = distances < self.clearance.horizon
-            return np.ascontiguousarray(rows[near]), distances[near]
-        return rows, distances
+            kept = near.distance < self.clearance.horizon
+            near = _Nearest(
+                near.pair[kept], near.distance[kept], near.normal[kept], near.first[kept], near.second[kept]
+            )
+        rows = _rates(J, near.normal, near.second, self._carry_second[near.pair])
+        rows -= _rates(J, near.normal, near.first, self._carry_first[near.pair])
+        return rows, near.distance, near.pair
 
-    def _ends(self, distances: Floats, normals: Floats) -> list[tuple[int, float, Floats, Floats, Floats]]:
-        """Return where else pairs are nearly as near: of each the pair, the distance, the normal and two points."""
-        found, shapes, placements = [], self._geometry.geometryObjects, self._results.oMg
-        for i, pair in enumerate(self._geometry.collisionPairs):
-            if not 0.0 < distances[i] < NEARLY_PARALLEL_BELOW:
-                continue
-            for own, other, normal in ((pair.first, pair.second, normals[i]), (pair.second, pair.first, -normals[i])):
-                for point in _facing(shapes[own].geometry, placements[own], normal):
-                    if normal @ point < (normal @ placements[own].translation) - 1e9:
-                        continue
-                    self._result.clear()
-                    at = coal.Transform3s(np.eye(3), point)
-                    there = coal.Transform3s(placements[other].rotation, placements[other].translation)
-                    distance = coal.distance(POINT, at, shapes[other].geometry, there, self._request, self._result)
-                    if distance > distances[i] + NEARLY or distance <= 0.0:
-                        continue
-                    near, far = self._result.getNearestPoint1(), self._result.getNearestPoint2()
-                    if own == pair.first:
-                        found.append((i, distance, self._result.normal.copy(), near.copy(), far.copy()))
-                    else:
-                        found.append((i, distance, -self._result.normal, far.copy(), near.copy()))
+    def _ends(self, near: _Nearest) -> list[tuple[int, float, Floats, Floats, Floats]]:
+        """Return where else pairs are nearly as near as where they are nearest.
+
+        Whatever is far from the plane through the other's nearest point, or from the box about the other, is not.
+        """
+        ends, placements = self._candidates, self._results.oMg
+        R = np.array([placement.rotation for placement in placements])
+        t = np.array([placement.translation for placement in placements])
+        own, other = (near.first, near.second), (near.second, near.first)
+        first = ends.sign[:, None] > 0.0
+        mine, theirs = (np.where(first, both[0][ends.pair], both[1][ends.pair]) for both in (own, other))
+        towards, axes = near.normal[ends.pair] * ends.sign[:, None], R[ends.own][:, :, 2]
+        across = towards - np.sum(towards * axes, axis=1)[:, None] * axes
+        across *= (ends.radius / np.maximum(np.linalg.norm(across, axis=1), 1e-9))[:, None]
+        points = np.einsum("cij,cj->ci", R[ends.own], ends.point) + t[ends.own] + across
+        local = np.einsum("cji,cj->ci", R[ends.other], points - t[ends.other]) - ends.centre
+        apart = np.linalg.norm(np.maximum(np.abs(local) - ends.half, 0.0), axis=1)
+        least, distance = np.maximum(np.sum(towards * (theirs - points), axis=1), apart), near.distance[ends.pair]
+        close = (distance > 0.0) & (distance < self.clearance.distance + CLOSE) & (least < distance + NEARLY)
+        close &= np.max(np.abs(points - mine), axis=1) > 1e-3  # the nearest point itself has its row
+        found, request, result = [], self._request, self._result
+        for c in np.flatnonzero(close):
+            placement = placements[int(ends.other[c])]
+            there = coal.Transform3s(placement.rotation, placement.translation)
+            shape = self._geometry.geometryObjects[int(ends.other[c])].geometry
+            result.clear()
+            coal.distance(POINT, coal.Transform3s(EYE, points[c]), shape, there, request, result)
+            apart_by, normal, *both = _numbers(result)
+            if 0.0 < apart_by < distance[c] + NEARLY:
+                both = both if ends.sign[c] > 0.0 else both[::-1]
+                found.append((int(ends.pair[c]), apart_by, ends.sign[c] * normal, both[0], both[1]))
         return found
 
     def refuse_overlaps(self, q: Floats) -> None:
@@ -200,26 +196,77 @@ class Distances:
         for pair, result in zip(self.names, self._results.distanceResults, strict=True):
             if result.min_distance < 0.0:
                 raise InputError(
-                    f"'{pair[0]}' and '{pair[1]}' of '{self.robot.name}' are {-result.min_distance:.3g} m in each other; "
-                    "start elsewhere, or put the pair in `ignored` if its shapes always overlap"
+                    f"'{pair[0]}' and '{pair[1]}' of '{self.robot.name}' are {-result.min_distance:.3g} m in each "
+                    "other; start elsewhere, or put the pair in `ignored` if its shapes always overlap"
                 )
 
 
-def _facing(shape: object, placement: pin.SE3, normal: Floats) -> Floats:
-    """Return the corners (c, 3) of a box, or the ends of a cylinder, that face along the normal."""
-    R = placement.rotation
-    towards = R.T @ normal
+class _Nearest(NamedTuple):
+    """Where pairs are near: of each the pair, the distance, the normal from first to second, a point on either."""
+
+    pair: NDArray[np.int64]
+    distance: Floats
+    normal: Floats
+    first: Floats
+    second: Floats
+
+    @classmethod
+    def of(cls, found: list[tuple[int, float, Floats, Floats, Floats]]) -> _Nearest:
+        """Collect them."""
+        pair, *others = zip(*found, strict=True)
+        return cls(np.array(pair, dtype=np.int64), *(np.array(values) for values in others))
+
+
+def _numbers(result: coal.DistanceResult) -> tuple[float, Floats, Floats, Floats]:
+    """Return distance, normal and nearest points of Coal's result; later ones do not change them."""
+    return (
+        result.min_distance,
+        np.array(result.normal),
+        np.array(result.getNearestPoint1()),
+        np.array(result.getNearestPoint2()),
+    )
+
+
+@dataclass(frozen=True)
+class _Candidates:
+    """Corners of boxes and ends of cylinders and capsules, one entry for each pair that one belongs to."""
+
+    pair: NDArray[np.int64]
+    sign: Floats  # 1.0 where it is on the pair's first shape, -1.0 on the second
+    own: NDArray[np.int64]  # the shape that it is on
+    other: NDArray[np.int64]
+    point: Floats  # (c, 3) in that shape's frame
+    radius: Floats  # of the rim about it, from which the point that faces the other is taken
+    centre: Floats  # (c, 3) of a box about the other, in the other's frame
+    half: Floats  # (c, 3) half its edges
+
+    @classmethod
+    def of(cls, geometry: pin.GeometryModel) -> _Candidates:
+        """Collect those of all collision pairs."""
+        shapes = [shape.geometry for shape in geometry.geometryObjects]
+        boxes = []
+        for shape in shapes:
+            shape.computeLocalAABB()
+            low, high = shape.aabb_local.min_, shape.aabb_local.max_
+            boxes.append((0.5 * (low + high), 0.5 * (high - low)))
+        found = []
+        for i, pair in enumerate(geometry.collisionPairs):
+            for own, other, sign in ((pair.first, pair.second, 1.0), (pair.second, pair.first, -1.0)):
+                points, radius = _corners(shapes[own])
+                found += [(i, sign, own, other, point, radius, *boxes[other]) for point in points]
+        columns = list(zip(*found, strict=True)) if found else [()] * 8
+        pair, own, other = (np.array(columns[c], dtype=np.int64) for c in (0, 2, 3))
+        point, centre, half = (np.array(columns[c], dtype=float).reshape(-1, 3) for c in (4, 6, 7))
+        return cls(pair, np.array(columns[1]), own, other, point, np.array(columns[5]), centre, half)
+
+
+def _corners(shape: Any) -> tuple[Floats, float]:
+    """Return corners (c, 3) of a box, or the centres of a cylinder's or a capsule's ends and its radius."""
     if isinstance(shape, coal.Box):
-        signs = CORNERS[CORNERS @ (shape.halfSide * towards) > 0.0] if True else CORNERS
-        corners = signs * shape.halfSide
-    elif isinstance(shape, coal.Cylinder):
-        across = np.array([towards[0], towards[1], 0.0])
-        length = np.linalg.norm(across)
-        across *= shape.radius / length if length > 1e-9 else 0.0
-        corners = np.array([across + [0.0, 0.0, shape.halfLength], across - [0.0, 0.0, shape.halfLength]])
-    else:
-        return np.empty((0, 3))
-    return corners @ R.T + placement.translation
+        return np.array(list(product((-1.0, 1.0), repeat=3))) * shape.halfSide, 0.0
+    if isinstance(shape, coal.Cylinder | coal.Capsule):
+        return np.array([[0.0, 0.0, shape.halfLength], [0.0, 0.0, -shape.halfLength]]), shape.radius
+    return np.empty((0, 3)), 0.0
 
 
 def _rates(J: Floats, normals: Floats, points: Floats, carried: Floats) -> Floats:
@@ -231,9 +278,10 @@ def _geometry(robot: Robot) -> pin.GeometryModel:
     try:
         geometry = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
     except (ValueError, RuntimeError) as error:
+        why = " ".join(str(error).split())
         raise ModelError(
-            f"robot '{robot.name}': a collision shape cannot be read: {error}; a mesh needs its full path, or its package "
-            "in ROS_PACKAGE_PATH"
+            f"robot '{robot.name}': a collision shape cannot be read; give its mesh a full path, or name the folder of "
+            f"its package in ROS_PACKAGE_PATH: {why}"
         ) from error
     for shape in geometry.geometryObjects:
         if hasattr(shape.geometry, "buildConvexRepresentation"):

@@ -477,6 +477,7 @@ class SelectiveLaw:
         )
         self._distances = None if limits.clearance is None else Distances(self.robot, limits.clearance)
         self._scale: Floats | None = None if np.all(scale == 1.0) else scale
+        self._positions: Floats = np.zeros(self._n)
         self._rows: Floats = np.zeros((self._k + layout.size, self._n))
         self._sides: Floats = np.zeros(self._k + layout.size + 1)
         self._places = [slice(self._k + rows.start, self._k + rows.stop) for rows in layout.level_rows]
@@ -617,17 +618,21 @@ class SelectiveLaw:
         """Do what `selective_command` does, and bring the rates inside the limits."""
         fixed, made = self._prepared[4], (self._matrices, self._drift, self._rates, self._rows, self._sides)
         status = kernel.pose_command(*fixed, target, target_velocity, previous, out, q, *made)  # type: ignore[arg-type]
+        self._positions[:] = self._prepared[3][2][kernel.JOINT_POSITION]
         if status == kernel.OK and not self.hold_nodes:
             self._bring_inside(q, previous, out)  # type: ignore[arg-type]
         return status
 
-    def _bring_inside(self, q: ArrayLike, previous: Floats, out: Floats) -> None:
-        """Bring the rates in `out` inside the limits, on the matrices that they were made with."""
+    def _bring_inside(self, q: ArrayLike, previous: Floats, out: Floats, goal: Floats | None = None) -> None:
+        """Bring the rates in `out` inside the limits, on the matrices that they were made with.
+
+        The tasks are done as well as they can be, or the rates are as near to the goal (n,) as they can be.
+        """
         assert self._step is not None
         _, _, _, (U_c, _, columns, parameters), _ = self._prepared
         n, k, rows, sides, scale = self._n, self._k, self._rows, self._sides, self._scale
-        results, positions = out[6 + n :], columns[kernel.JOINT_POSITION]
-        apart, distances = (None, None) if self._distances is None else self._distances(np.asarray(q))
+        results, positions = out[6 + n :], self._positions
+        apart, distances = (None, None) if self._distances is None else self._distances(np.asarray(q))[:2]
         plain = out[6 : 6 + n]
         if scale is not None:
             positions, previous, plain = positions / scale, previous / scale, plain / scale
@@ -636,6 +641,8 @@ class SelectiveLaw:
             (rows[place], sides[place], float(results[rho]))
             for place, rho in zip(self._places, self._rhos, strict=True)
         ]
+        if goal is not None:
+            levels = [(np.eye(n), goal if scale is None else goal / scale, 0.0)]
         self.limited = self._step(
             positions, previous, plain, rows[:k], sides[:k], levels, apart, distances, float(sides[-1])
         )
@@ -647,6 +654,32 @@ class SelectiveLaw:
             found = found - np.linalg.pinv(rows[:k]) @ (J_sub @ (scale * found) - self.limited.share * sides[:k])
         kernel.take_rates(self._matrices, self._drift, U_c, columns, parameters, found, out)
         results[kernel.EXCESS], results[kernel.LIMITED] = self.limited.excess, self.limited.count
+
+    def check_start(self, q: ArrayLike) -> None:
+        """Look at a start configuration before a motion; a law without `limits` has nothing to say.
+
+        Raises:
+            InputError: two bodies that shall stay apart are in each other.
+
+        Warns:
+            DecoupleWarning: joints are outside their position limits: the law brings them back first.
+        """
+        if self._step is None or self.limits is None:
+            return
+        if self._distances is not None:
+            self._distances.refuse_overlaps(self.robot.checked(q))
+        positions, limits = self.robot.joint_positions(q), self.limits.positions(self.robot)
+        outside = np.flatnonzero((positions < limits[:, 0]) | (positions > limits[:, 1]))
+        if outside.size:
+            told = [
+                f"{self.robot.joint_names[j]} at {positions[j]:.4g} ({limits[j, 0]:.4g} to {limits[j, 1]:.4g})"
+                for j in outside
+            ]
+            warnings.warn(
+                f"outside their position limits at the start, and brought back first: {', '.join(told)}",
+                DecoupleWarning,
+                stacklevel=3,
+            )
 
     def base_twist(self, q: Floats, joint_rates: Floats) -> Floats:
         """Return the base twist (6,), base axes, that joint rates (n,) and the momentum on board cause at q.
@@ -698,7 +731,8 @@ class SelectiveLaw:
             # A blend of nothing with the given rates, in the kernel's words: their projection.
             columns, parameters, kept = columns.copy(), parameters.copy(), results.copy()
             columns[kernel.RATE_STEP], parameters[kernel.LIMITS_STEPS] = 0.0, 1.0
-            status, change = self._plan(q, (columns, parameters), target_velocity, velocity[6:].copy(), out)
+            settings, last = (columns, parameters), velocity[6:].copy()
+            status, change = self._plan(q, settings, target_velocity, last, out, previous)
             kept[: kernel.POSITION] = results[: kernel.POSITION]
             results[:] = kept
         results[kernel.POSITION :][:3], errors[:] = kept_position, kept_errors  # as the base twist
@@ -706,9 +740,18 @@ class SelectiveLaw:
         return status
 
     def _plan(
-        self, q: ArrayLike, settings: tuple[Floats, Floats], velocities: Floats, previous: Floats, out: Floats
+        self,
+        q: ArrayLike,
+        settings: tuple[Floats, Floats],
+        velocities: Floats,
+        previous: Floats,
+        out: Floats,
+        commanded: Floats | None = None,
     ) -> tuple[int, float]:
-        """Iterate on mean matrices and command; return the status and the last relative change of the rates."""
+        """Iterate on mean matrices and command; return the status and the last relative change of the rates.
+
+        Where `previous` are rates to be projected, `commanded` are those that were commanded before.
+        """
         model, data, _, (U_c, tasks, columns, _), fixed = self._prepared
         hold, matrices, drift, rates = float(self.sample_time or 0.0), self._matrices, self._drift, self._rates
         targets = self._later
@@ -731,7 +774,10 @@ class SelectiveLaw:
                 kernel.pose_rows(
                     matrices, drift, U_c, tasks, *settings, velocities, rates, results, self._rows, self._sides
                 )
-                self._bring_inside(q, previous, out)
+                if commanded is None:
+                    self._bring_inside(q, previous, out)
+                else:
+                    self._bring_inside(q, commanded, out, goal=previous)
             velocity[:6] = self._J_here @ velocity[6:] + self._base_drift
             change = kernel.change_of(velocity[6:], before)
             if status != kernel.OK or change <= CONVERGED:

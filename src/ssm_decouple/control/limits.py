@@ -74,7 +74,8 @@ class Limits:
             limits = limits.T
         if limits.shape != (n, 2):
             raise InputError(
-                f"position limits have shape {limits.shape}; '{robot.name}' needs ({n}, 2): lower and upper, a row a joint"
+                f"position limits have shape {limits.shape}; '{robot.name}' needs ({n}, 2): lower and upper, a "
+                "row a joint"
             )
         for name, (lower, upper) in zip(robot.joint_names, limits, strict=True):
             if not (lower < upper and lower < np.inf and upper > -np.inf):
@@ -185,6 +186,7 @@ class _Buffers:
     sides: Floats
     factors: Floats
     told: Floats
+    given: tuple[Floats, ...] = ()  # positions, J_sub and rows of the step that is made
     problems: dict[tuple[int, int], _Problem] = field(default_factory=dict)
 
     def problem(self, size: int, bounds: int) -> _Problem:
@@ -257,12 +259,12 @@ class LimitedStep:
         distances: Floats | None = None,
         noise: float = 0.0,
     ) -> LimitedRates:
-        """Return the rates.
+        """Return the rates; arrays are of floats and contiguous by rows.
 
         Args:
             positions: Joint positions (n,), rad or m.
             previous: The rates commanded before (n,), zeros from rest.
-            plain: The rates that do the tasks without limits (n,): returned as they are where they keep all limits.
+            plain: The rates that do the tasks without limits (n,): returned, the array itself, where they keep all limits.
             J_sub: (k, n).
             wanted: What J_sub q_dot shall be (k,).
             levels: Tasks in strict priority, of each level J_l (m_l, n), v_l (m_l,) and rho_l: it minimises
@@ -291,17 +293,17 @@ class LimitedStep:
             return LimitedRates(plain, self.robot.joint_names)
         if status == kernel.NOT_FINITE:
             raise InputError("positions, rates, J_sub, what is wanted of it or distances are not finite")
-        self._given = (positions, J_sub, rows)
+        buffers.given = (positions, J_sub, rows)
         rates = table[kernel.BRAKE].copy()
         excess = self._least_excess(buffers, previous, rates) if status == kernel.EXCEEDED else 0.0
         if excess == 0.0:
             self._solve(buffers, levels, rates)
-        share = told[kernel.SHARE] if told[kernel.ASKED] else 1.0
+        share = 1.0
+        if told[kernel.ASKED]:
+            share = min(max(float(rates @ table[kernel.FIXED] / told[kernel.LENGTH] ** 2), 0.0), 1.0)
         bounds = table[: kernel.RETURN + 1].copy()
         near = buffers.sides[kernel.APART].copy() if len(distances) else None
-        return LimitedRates(
-            rates, self.robot.joint_names, bounds, near, float(share), excess, bool(told[kernel.STOPPABLE])
-        )
+        return LimitedRates(rates, self.robot.joint_names, bounds, near, share, excess, bool(told[kernel.STOPPABLE]))
 
     def _fitting(self, key: tuple[Any, ...]) -> _Buffers:
         """Return buffers for arguments of these shapes, which are checked once."""
@@ -311,8 +313,8 @@ class LimitedStep:
         right = right and J_sub[1] == J[1] == rows[1] == n
         if not (right and wanted == J_sub[:1] and distances == rows[:1] and J[0] == sum(sizes) and sizes):
             raise InputError(
-                f"shapes do not fit {n} joints: positions {positions}, previous {previous}, plain {plain}, J_sub {J_sub}, "
-                f"wanted {wanted}, J {J} for levels of {sizes} rows, rows {rows}, distances {distances}"
+                f"shapes do not fit {n} joints: positions {positions}, previous {previous}, plain {plain}, J_sub "
+                f"{J_sub}, wanted {wanted}, J {J} for levels of {sizes} rows, rows {rows}, distances {distances}"
             )
         k, m = J_sub[0], J[0]
         return _Buffers(
@@ -324,30 +326,40 @@ class LimitedStep:
 
     def _solve(self, buffers: _Buffers, levels: Sequence[Level], rates: Floats) -> None:
         """Move rates (n,), which keep all limits, level by level to the best that keep them."""
-        n, table, told, (_, _, G) = len(rates), buffers.table, buffers.told, self._given
+        n, table, told, (_, _, G) = len(rates), buffers.table, buffers.told, buffers.given
         first, asked = int(told[kernel.RANK]), int(told[kernel.ASKED])
         if told[kernel.RETURNING]:
             joints, pairs = np.flatnonzero(table[kernel.RETURN]), np.flatnonzero(buffers.sides[kernel.APART])
             J = np.vstack([np.eye(n)[joints], G[pairs]])
             v = np.r_[table[kernel.RETURN, joints], buffers.sides[kernel.APART, pairs]]
-            self._step(buffers, J, v, 0.0, first - asked, n - first + asked, asked, rates)
+            self._step(buffers, J, v, 0.0, 0.0, first - asked, n - first + asked, asked, rates)
             kernel.hold_return(table, buffers.sides, G, rates)
         if asked:
             length = told[kernel.LENGTH]
             direction = table[kernel.FIXED : kernel.FIXED + 1] / length
-            self._step(buffers, direction, np.array([length]), 0.0, first - 1, 1, asked, rates)
+            # More than is wanted is asked for, and a bound keeps it to that: so no regularisation takes from it.
+            self._step(buffers, direction, np.array([1.01 * length]), 0.0, 0.0, first - 1, 1, asked, rates)
         for number, (J, v, rho) in enumerate(levels):
             if first == n:
                 break
             decided = int(told[kernel.COUNTS + number])
-            self._step(buffers, J, v, rho, first, decided, 0, rates)
+            self._step(buffers, J, v, rho, kernel.STEADY, first, decided, 0, rates)
             first += decided
 
     def _step(
-        self, buffers: _Buffers, J: Floats, v: Floats, rho: float, first: int, decided: int, asked: int, rates: Floats
+        self,
+        buffers: _Buffers,
+        J: Floats,
+        v: Floats,
+        rho: float,
+        steady: float,
+        first: int,
+        decided: int,
+        asked: int,
+        rates: Floats,
     ) -> None:
         """Solve one level in the directions from `first` on, and move the rates there as far as the limits allow."""
-        positions, J_sub, G = self._given
+        positions, J_sub, G = buffers.given
         told, n = buffers.told, len(rates)
         problem = buffers.problem(n - first, n + len(G) + asked)
         kernel.pose(
@@ -359,6 +371,7 @@ class LimitedStep:
             first,
             decided,
             rho,
+            steady,
             told[kernel.SCALE],
             rates,
             problem.H,
@@ -403,14 +416,14 @@ class LimitedStep:
         y = problem.solve()
         rates[:] = 0.0
         if y is not None:
-            kernel.settle(self._given[1], table, buffers.factors, told, first, scale * y[:d], rates)
+            kernel.settle(buffers.given[1], table, buffers.factors, told, first, scale * y[:d], rates)
         excess = float(np.max(np.abs(rates - previous)[limited] / self._steps[limited], initial=0.0) - 1.0)
         if excess > KEPT:
             table[kernel.HIGH], table[kernel.LOW] = table[kernel.HARD_HIGH], table[kernel.HARD_LOW]
             table[kernel.HIGH_KIND], table[kernel.LOW_KIND] = kernel.ACCELERATIONS, kernel.ACCELERATIONS
             return excess
         table[kernel.BRAKE] = rates
-        given = (self._columns, self._parameters, self._given[0], previous, self._given[2])
+        given = (self._columns, self._parameters, buffers.given[0], previous, buffers.given[2])
         kernel.fill_bounds(*given, table, buffers.sides, told)
         return 0.0
 

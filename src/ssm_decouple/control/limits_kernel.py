@@ -76,10 +76,9 @@ LENGTH = 2  # of FIXED
 STOPPABLE = 3  # 1.0 if BRAKE can be scaled down to rest before any limit
 RETURNING = 4  # how many joints are outside their limits and how many pairs too near
 SCALE = 5  # of the rates
-SHARE = 6  # of what is wanted of J_sub
-HOLD = 7  # way per speed, s, of braking all together
-CAP = 8  # longest braking time, s, at which the turning of null(J_sub) leaves enough acceleration
-COUNTS = 9
+HOLD = 6  # way per speed, s, of braking all together
+CAP = 7  # longest braking time, s, at which the turning of null(J_sub) leaves enough acceleration
+COUNTS = 8
 
 # Which limit a bound comes from.
 NONE = 0
@@ -105,6 +104,10 @@ CURVATURE_SHARE = 0.5
 # Weight of the smallest rates beside a level's task, relative to the square of its rows.
 SMALLEST = 1e-8
 SOLVABLE = 1e-12  # the same in the coordinates that the task itself decides
+# Weight of the change of the rates, in the same units: where limits leave a task hardly any effect, its sign changes
+# from sample to sample, and rates would jump from bound to bound. What the task does not decide fades besides.
+STEADY = 1e-3
+FADE = 0.9
 STOPS = 1e-14  # rad or m: rounding of the way to rest
 ROUNDING = 1e-12  # of the QP solver's answer, in its units
 
@@ -517,30 +520,28 @@ def fill_brake(
     # The turning of null(J_sub), and of what joints at their limits leave of it, grows with the square of the rates.
     kept = CURVATURE_SHARE * (1.0 - braking)
     told[CAP] = time * np.sqrt(kept / turned) if turned > 1e-6 * kept else np.inf
-    if keeps_hard_limits(brake, previous, positions, columns, parameters):
-        if overshoot(brake, positions, columns, parameters, G, sides) <= STOPS:
-            return 2
-    # Harder, as far as the acceleration limits go.
-    least, most = 0.0, 1.0
+    stops = overshoot(brake, positions, columns, parameters, G, sides) <= STOPS
+    if stops and keeps_hard_limits(brake, previous, positions, columns, parameters):
+        return 2
+    # Harder, as far as the acceleration limits go: the same times a factor from `least` to `most`.
+    least, most, base = 0.0, 1.0, table[END]
     for j in range(n):
-        p, step = abs(carried[j]), STEP_INSIDE * columns[ACCELERATION, j] * dt
-        along, sign = (previous[j], 1.0) if carried[j] > 0.0 else (-previous[j], -1.0)
+        base[j] = brake[j]
+        p, step = abs(base[j]), STEP_INSIDE * columns[ACCELERATION, j] * dt
+        along, sign = (previous[j], 1.0) if base[j] > 0.0 else (-previous[j], -1.0)
         if p == 0.0:
             least = 2.0 if abs(along) > step else least
             continue
         least, most = max(least, (along - step) / p), min(most, (along + step) / p)
         most = min(most, (hard_speed(columns, parameters, positions, j, sign) + STOPS) / p)
     if least > most:
-        for j in range(n):
-            brake[j] = paced * carried[j]
         return 0
-    most = max(min(paced, most), least)
     for j in range(n):
-        brake[j] = most * carried[j]
+        brake[j] = most * base[j]
     fill(table[SCRATCH], 0.0)
     factor = most * stoppable_share(table[SCRATCH], brake, positions, columns, parameters, G, sides, table[TRIAL])
     for j in range(n):
-        brake[j] = max(factor, least) * carried[j]
+        brake[j] = max(factor, least) * base[j]
     return 2 if factor >= least * STEP_INSIDE else 1
 
 
@@ -567,10 +568,10 @@ def inside(table: Floats, sides: Floats, G: Floats, rates: Floats) -> bool:
     for j in range(rates.shape[0]):
         if not table[LOW, j] <= rates[j] <= table[HIGH, j]:
             return False
+    within = True
     for i in range(G.shape[0]):
-        if closing_speed(G, i, rates) > -sides[FLOOR, i]:
-            return False
-    return True
+        within = within and closing_speed(G, i, rates) <= -sides[FLOOR, i]
+    return within
 
 
 @compiled
@@ -704,9 +705,9 @@ def prepare(
     hold = max(SOFTER * stretch(longest, dt), dt / DAMPER)
     told[HOLD] = hold
     fill_bounds(columns, parameters, positions, previous, G, table, sides, told)
-    if keeps > 0 and told[RETURNING] == 0.0 and inside(table, sides, G, plain):
-        if overshoot(plain, positions, columns, parameters, G, sides) <= STOPS:
-            return INSIDE
+    free = keeps > 0 and told[RETURNING] == 0.0 and inside(table, sides, G, plain)
+    if free and overshoot(plain, positions, columns, parameters, G, sides) <= STOPS:
+        return INSIDE
     largest, bounds = 0.0, 0.0
     for j in range(n):
         largest = max(largest, abs(plain[j]))
@@ -728,6 +729,7 @@ def pose(
     first: int,
     decided: int,
     rho: float,
+    steady: float,
     scale: float,
     anchor: Floats,
     H: Floats,
@@ -740,7 +742,8 @@ def pose(
     """Pose the QP of one level in the directions from `first` on: min |J q_dot - v|^2 + rho |q_dot|^2 in the bounds.
 
     In the directions before it q_dot is what it is in anchor (n,). The directions from first + decided on do not move
-    the level. Rates are in units of `scale`. `length` is how long the first direction may be, where it is that of what
+    the level. `steady` is the weight of the change from CARRIED, relative to that of the rows. Rates are in units of
+    `scale`. `length` is how long the first direction may be, where it is that of what
     is wanted of J_sub; 0 for no such limit.
     """
     n, size, d, c = J.shape[1], J.shape[0], f.shape[0], G.shape[0]
@@ -779,7 +782,9 @@ def pose(
                 H[a, b] += part_of[a] * part_of[b]
     weight = square if square > 0.0 else 1.0
     for a in range(d):
-        H[a, a] += max(rho, (SOLVABLE if a < decided else SMALLEST) * weight)
+        fade = 1.0 if a < decided else FADE
+        H[a, a] += max(rho, (SOLVABLE if a < decided else SMALLEST) * weight) + steady * weight
+        f[a] -= steady * weight * fade * dot(table[BASIS + first + a], table[CARRIED]) / scale
     for j in range(n):  # a little inside, where what is known to be inside leaves room for it
         upper = max(table[HIGH, j] - ROUNDING * scale, min(anchor[j], table[HIGH, j]))
         lower = min(table[LOW, j] + ROUNDING * scale, max(anchor[j], table[LOW, j]))
@@ -854,7 +859,8 @@ def finish(
         part = min(max(part / told[LENGTH] ** 2, 0.0), 1.0)
     for _ in range(2):
         take_out_leak(J_sub, table, factors, int(told[RANK]), part, anchor)
-    told[SHARE] = part
+    stops = overshoot(anchor, positions, columns, parameters, G, sides) <= 10.0 * STOPS
+    told[STOPPABLE] = 1.0 if stops else 0.0
 
 
 @compiled
@@ -876,7 +882,6 @@ def settle(J_sub: Floats, table: Floats, factors: Floats, told: Floats, first: i
     if told[ASKED] > 0.0:
         part = min(max(part / told[LENGTH] ** 2, 0.0), 1.0)
     take_out_leak(J_sub, table, factors, int(told[RANK]), part, rates)
-    told[SHARE] = part
 
 
 @compiled

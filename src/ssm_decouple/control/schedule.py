@@ -241,6 +241,10 @@ class ScheduledLaw(SelectiveLaw):
         told = [schedule.shares(*schedule.at(t, q)) for t, q in zip(time.tolist(), configurations, strict=True)]
         return np.array(told).reshape(len(time), schedule.k)
 
+    def check_start(self, q: ArrayLike) -> None:
+        """Look at a start configuration, as `SelectiveLaw.check_start` does."""
+        self.phases[0].check_start(q)
+
     def lost_direction(self, q: ArrayLike) -> LostDirection:
         """Refuse: it is a matter of one protection.
 

@@ -117,6 +117,14 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
 
 _WHEEL_MOMENTUM = {"units": "N m s", "frame": "base", "long_name": "momentum of each wheel about its axis"}
 _SHARE = {"units": "1", "frame": "", "long_name": "how far each direction is protected: 0 not, 1 fully"}
+_OF_LIMITS = {
+    "acceleration_excess": {
+        "units": "1",
+        "frame": "",
+        "long_name": "how far acceleration limits are exceeded, of them",
+    },
+    "active_limits": {"units": "1", "frame": "", "long_name": "joints that stand at a bound of their rates"},
+}
 _TASK_ERROR = {"units": "m or rad", "frame": "as the task says", "long_name": "error of each task row"}
 
 
@@ -275,6 +283,9 @@ def build_motion(
     if not layout.usual:
         variables["task_error"] = xr.Variable(("time", "task_row"), errors, _TASK_ERROR, fastpath=True)
         coordinates |= {"task_row": list(layout.row_names), "task_level": ("task_row", np.array(layout.row_levels))}
+    if law.limits is not None:
+        for name, row in (("acceleration_excess", kernel.EXCESS), ("active_limits", kernel.LIMITED)):
+            variables[name] = xr.Variable(("time",), results[:, row], _OF_LIMITS[name], fastpath=True)
     if shares is not None:
         variables["protection_share"] = xr.Variable(("time", "protected"), shares, _SHARE, fastpath=True)
     attributes = _attributes(law)

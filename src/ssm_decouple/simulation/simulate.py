@@ -110,6 +110,7 @@ def simulate(
     run = _Run(law, law.robot.checked(q).copy(), time, reference, pace, method)
     if law.layout.tool_target is not None:
         _warn_out_of_reach(law, run.configurations[0], reference(0.0)[0][law.layout.tool_target])
+    law.check_start(run.configurations[0])
     run.settings = {"arrival_tolerance": arrival_tolerance, "smooth_start": float(smooth_start)}
     tick = max(1, time.size // 100)
     try:

@@ -308,8 +308,8 @@ def _case(content: dict[str, Any], path: Path) -> Case:
 
 
 def _limits(given: Mapping[str, Any]) -> Limits:
-    clearance = {"clearance": Clearance(given["clearance"])} if "clearance" in given else {}
-    return Limits(**{key: value for key, value in given.items() if key != "clearance"}, **clearance)
+    clearance = Clearance(given["clearance"]) if "clearance" in given else None
+    return Limits(braking=given.get("braking", 0.8), clearance=clearance)
 
 
 def _protection(given: Mapping[str, Any]) -> Protection | Schedule:
