@@ -7,6 +7,8 @@ import pinocchio as pin
 import pytest
 
 import ssm_decouple as ssm
+from ssm_decouple.studies.comparison import summarise
+from ssm_decouple.viewing.table import saturation
 
 MISSION = """
 robot = "ets_vii"
@@ -118,3 +120,19 @@ def test_a_task_table_of_another_kind_is_refused(write):
         ssm.load_case(write(text, "odd.toml"))
     with pytest.raises(ssm.InputError, match=r"give \[target\] position, or \[\[task\]\] tables"):
         ssm.load_case(write(text.replace("task = 3\n", ""), "odd.toml"))
+
+
+def test_full_wheels_are_told(ets_vii):
+    """Two wheels of little momentum: one is filled from the start, and slows down when the arm gives momentum back."""
+    axes = {"wheel_y": [0, 1, 0], "wheel_z": [0, 0, 1]}
+    wheels = [ssm.Wheel(name, axis, spin_inertia=0.01, max_speed=100.0, max_torque=1.0) for name, axis in axes.items()]
+    robot = ets_vii.with_wheels(wheels)
+    start = robot.configuration({f"joint_{i + 1}": np.deg2rad(a) for i, a in enumerate([150, -20, -10, 0, 0, 0])})
+    law = ssm.SelectiveLaw(robot, ssm.Protection("all"), gain=0.05)
+    motion = ssm.simulate(law, start, [-1.8, -0.3, 1.2], 150.0, 0.1)
+    motion.attrs |= {"case": "wheels", "case_U_c": "[[0], [0], [0], [0], [0], [1]]", "case_frame": "base"}
+    row = summarise(motion, "selective")
+    full = np.abs(motion.joint_rates.sel(joint="wheel_y")).values >= 100.0 * (1 - 1e-9)
+    assert full.any()
+    assert row.full_wheels.startswith(f"wheel_y from {motion.time.values[full.argmax()]:.1f} to ")
+    assert saturation(row).startswith("wheels, selective: at full speed: wheel_y from ")

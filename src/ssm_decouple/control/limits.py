@@ -264,7 +264,8 @@ class LimitedStep:
         Args:
             positions: Joint positions (n,), rad or m.
             previous: The rates commanded before (n,), zeros from rest.
-            plain: The rates that do the tasks without limits (n,): returned, the array itself, where they keep all limits.
+            plain: The rates that do the tasks without limits (n,): the array itself is returned where they keep all
+                limits.
             J_sub: (k, n).
             wanted: What J_sub q_dot shall be (k,).
             levels: Tasks in strict priority, of each level J_l (m_l, n), v_l (m_l,) and rho_l: it minimises

@@ -52,6 +52,7 @@ class Summary:
         centre_of_mass_drift_m: How far the centre of mass wandered from where the linear momentum takes it: the
             integrator's error, zero in physics.
         saturated: In a dynamic simulation, from when to when, s, a drive stood at its torque limit.
+        full_wheels: Which reaction wheels were at full speed, and from when to when, in words.
         lost: Of a stalled motion the direction that its tasks could move least at the end, and what took it, in words.
     """
 
@@ -77,6 +78,7 @@ class Summary:
     acceleration_max_deg_s2: float
     centre_of_mass_drift_m: float
     saturated: tuple[tuple[float, float], ...] = ()
+    full_wheels: str = ""
     lost: str = ""
 
 
@@ -120,8 +122,16 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         acceleration_max_deg_s2=float(np.rad2deg(np.abs(changes / np.diff(time)[:, None]).max())),
         centre_of_mass_drift_m=float(np.linalg.norm(drift, axis=1).max()),
         saturated=tuple((start, end) for start, end in json.loads(motion.attrs.get("saturated", "[]"))),
+        full_wheels=full_wheels(motion),
         lost=lost_direction(motion),
     )
+
+
+def full_wheels(motion: xr.Dataset) -> str:
+    """Return in words which reaction wheels were at full speed, and when; nothing where none was."""
+    found = json.loads(motion.attrs.get("saturated_wheels", "{}"))
+    spans = {name: ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in found[name][:3]) for name in found}
+    return "; ".join(f"{name} from {told}{' and again' if found[name][3:] else ''}" for name, told in spans.items())
 
 
 def _linear_velocity(motion: xr.Dataset) -> np.ndarray[Any, Any]:

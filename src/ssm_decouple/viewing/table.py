@@ -159,13 +159,15 @@ def _empty(headings: Sequence[str], words: Sequence[str]) -> Table:
 
 
 def saturation(row: Summary) -> str | None:
-    """Say when the drives stood at their torque limits; None if they never did."""
+    """Say when wheels were at full speed and drives at their torque limits; None if they never were."""
+    wheels = f"{row.case}, {row.law}: at full speed: {row.full_wheels}." if row.full_wheels else None
     if not row.saturated:
-        return None
+        return wheels
     total = sum(end - start for start, end in row.saturated)
     listed = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in row.saturated[:3])
     more = f" and {len(row.saturated) - 3} times more" if row.saturated[3:] else ""
-    return f"{row.case}, {row.law}: drives at their torque limits for {total:.1f} s: {listed}{more}."
+    drives = f"{row.case}, {row.law}: drives at their torque limits for {total:.1f} s: {listed}{more}."
+    return drives if wheels is None else f"{drives} {wheels}"
 
 
 def explain(row: Summary) -> str | None:
