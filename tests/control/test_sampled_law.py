@@ -82,7 +82,7 @@ def test_held_steps_are_of_sixth_order(ets_vii, rng):
     def after(steps):
         q, turned = q0, np.zeros(6)
         for i in range(steps):
-            q, more = held(law, None, None, q, values, 2.0 * i / steps, 2.0 * (i + 1) / steps)
+            q, more = held(law, None, q, values, 2.0 * i / steps, 2.0 * (i + 1) / steps)
             turned = turned + more
         return q, turned
 

@@ -50,7 +50,7 @@ def test_held_steps_with_momentum_are_of_fourth_order(ets_vii, rng):
         q = q0
         for i in range(steps):
             values[:6] = law.base_twist(q, rates)
-            q, _ = held(law, None, None, q, values, 2.0 * i / steps, 2.0 * (i + 1) / steps)
+            q, _ = held(law, None, q, values, 2.0 * i / steps, 2.0 * (i + 1) / steps)
         errors.append(np.linalg.norm(pin.difference(ets_vii.model, truth, q)))
     assert errors[0] < 1e-4
     np.testing.assert_allclose(np.log2(np.array(errors[:-1]) / errors[1:]), 4, atol=0.3)

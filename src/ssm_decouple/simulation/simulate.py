@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.control.schedule import ScheduledLaw
-from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_not_negative, as_triple
+from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_floats, as_not_negative, as_triple
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import build_motion, error_of, judge
-from ssm_decouple.simulation.steps import STEPS, Pace, Reference
+from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted
 
 Floats = NDArray[np.float64]
 Method = Literal["explicit", "held", "rk4"]
@@ -55,6 +55,7 @@ def simulate(
     stop_early: bool = False,
     progress: Progress | None = None,
     smooth_start: float = 0.0,
+    protected_rate: ArrayLike | Callable[[float], ArrayLike] | None = None,
 ) -> xr.Dataset:
     """Simulate the arm moving under a law while momentum turns and shifts the free base.
 
@@ -78,6 +79,9 @@ def simulate(
         progress: Called now and then with the share done, 0 to 1.
         smooth_start: Time, s, over which the law's pace rises from 0 to 1 as 10 x^3 - 15 x^4 + 6 x^5, so that rates and
             accelerations start from zero without a jump. Held commands take the pace of the middle of their hold.
+        protected_rate: b (k,), or a function of time, s, that returns it: what the protected rate shall be, so that the
+            arm turns the base about a protected axis while it works; None for zero. Held commands take that of the
+            middle of their hold. The record's `protected_angle` tells what came of it.
 
     Returns:
         The motion. Coordinates `time` (s), `joint`, `axis`, `twist`, `protected`; each variable has `units`, `frame`
@@ -106,8 +110,9 @@ def simulate(
     _refuse_unfit_method(law, method, duration, dt)
     if not (np.isfinite(arrival_tolerance) and arrival_tolerance > 0):
         raise InputError(f"arrival_tolerance is {arrival_tolerance}; it must be a positive distance, m")
-    pace, reference = _smooth_pace(smooth_start), _reference(law, target)
-    run = _Run(law, law.robot.checked(q).copy(), time, reference, pace, method)
+    reference = _reference(law, target)
+    demand = Demand(reference, _smooth_pace(smooth_start), _wanted(law, protected_rate, method))
+    run = _Run(law, law.robot.checked(q).copy(), time, demand, method)
     if law.layout.tool_target is not None:
         _warn_out_of_reach(law, run.configurations[0], reference(0.0)[0][law.layout.tool_target])
     law.check_start(run.configurations[0])
@@ -141,9 +146,9 @@ class _Run:
     """A simulation on its way: what has been computed so far, and how to go on by one sample."""
 
     def __init__(
-        self, law: SelectiveLaw, start: Floats, time: Floats, reference: Reference, pace: Pace, method: Method | Dynamic
+        self, law: SelectiveLaw, start: Floats, time: Floats, demand: Demand, method: Method | Dynamic
     ) -> None:
-        self.law, self.time, self.reference, self.pace, self.method = law, time, reference, pace, method
+        self.law, self.time, self.demand, self.method = law, time, demand, method
         self.dynamic = DynamicMotion(method, law, start, time[1] - time[0]) if isinstance(method, Dynamic) else None
         # A command that is held speaks for the middle of its hold, one of the continuous law for its own time.
         holds = np.diff(time, append=2 * time[-1] - time[-2])
@@ -166,12 +171,14 @@ class _Run:
         if i > 0:
             self.configurations[i], moved = self._move(i)
             self.twists[i] = self.twists[i - 1] + moved
-        self.targets[i], velocity = self.reference(time[i])
-        previous, pace = self.rates[i - 1] if i else self.at_rest, self.pace(time[i] + self.leads[i])
-        seen, wanted = self.configurations[i], None
+        self.targets[i], velocity = self.demand.reference(time[i])
+        middle = time[i] + self.leads[i]
+        previous, pace = self.rates[i - 1] if i else self.at_rest, self.demand.pace(middle)
+        seen, wanted = self.configurations[i], self.demand.protected_rate(middle)
         if self.dynamic is not None:
             self.dynamic.sample()
-            seen, wanted = self.dynamic.seen(), self.dynamic.correction()
+            seen, correction = self.dynamic.seen(), self.dynamic.correction()
+            wanted = wanted if correction is None else correction
         self.law.evaluate(seen, self.targets[i], velocity, self.values[i], previous, wanted, pace, time[i])
         self.done = i + 1
 
@@ -180,7 +187,7 @@ class _Run:
         if self.dynamic is not None:
             return self.dynamic.move(self.rates[i - 1], *span)
         step = STEPS[str(self.method)]
-        return step(self.law, self.reference, self.pace, self.configurations[i - 1], self.values[i - 1], *span)
+        return step(self.law, self.demand, self.configurations[i - 1], self.values[i - 1], *span)
 
     def ended(self, tolerance: float) -> bool:
         """Say whether the end-effector has arrived or has stalled."""
@@ -277,6 +284,28 @@ def _reference(law: SelectiveLaw, target: Any | Target) -> Reference:
         else _finite(law.layout.flat_targets(target), "target")
     )
     return lambda _: (fixed, at_rest)
+
+
+def _wanted(
+    law: SelectiveLaw, given: ArrayLike | Callable[[float], ArrayLike] | None, method: Method | Dynamic
+) -> Wanted:
+    """Return the protected rate that is asked for as a function of time."""
+    if given is None:
+        return lambda _: None
+    if isinstance(method, Dynamic) and (method.feedback_gain or (method.servo is not None and method.servo.protects)):
+        raise InputError(
+            "feedback_gain and a servo that protects hold the base still along the protected directions; leave them "
+            "out where a protected_rate is asked for"
+        )
+    if not callable(given):
+        constant = as_floats("protected_rate", given)
+        return lambda _: constant
+    function = given
+
+    def wanted(time: float) -> Floats:
+        return as_floats("protected_rate", function(time))
+
+    return wanted
 
 
 def _finite(values: Floats, name: str) -> Floats:

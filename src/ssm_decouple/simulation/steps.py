@@ -6,6 +6,7 @@ Each step returns the next configuration and the integral of the base twist (6,)
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -17,14 +18,25 @@ from ssm_decouple.momentum.flow import munthe_kaas
 Floats = NDArray[np.float64]
 Reference = Callable[[float], tuple[Floats, Floats]]  # time to target position and velocity
 Pace = Callable[[float], float]  # time to the share of the full pace
-Step = Callable[[SelectiveLaw, Reference, Pace, Floats, Floats, float, float], tuple[Floats, Floats]]
+Wanted = Callable[[float], Floats | None]  # time to the protected rate that is asked for, None for zero
+
+
+class Demand(NamedTuple):
+    """What is asked of the law, as functions of time, s."""
+
+    reference: Reference
+    pace: Pace
+    protected_rate: Wanted
+
+
+Step = Callable[[SelectiveLaw, Demand, Floats, Floats, float, float], tuple[Floats, Floats]]
 
 _SQRT_15 = 15.0**0.5
 _JUDGE = [(0.5 + 0.5 * node, 0.5 * weight) for node, weight in zip(*np.polynomial.legendre.leggauss(5), strict=True)]
 
 
 def explicit(
-    law: SelectiveLaw, reference: Reference, pace: Pace, q: Floats, values: Floats, t: float, t_next: float
+    law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float
 ) -> tuple[Floats, Floats]:
     """Hold joint rates and base twist: one Euler step on SE(3), how we read the paper."""
     model, h = law.robot.model, t_next - t
@@ -32,7 +44,7 @@ def explicit(
 
 
 def held(
-    law: SelectiveLaw, reference: Reference, pace: Pace, q: Floats, values: Floats, t: float, t_next: float
+    law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float
 ) -> tuple[Floats, Floats]:
     """Hold the joint rates; the base follows by a sixth-order Magnus expansion on three Gauss points.
 
@@ -62,13 +74,15 @@ def held(
 
 
 def runge_kutta(
-    law: SelectiveLaw, reference: Reference, pace: Pace, q: Floats, values: Floats, t: float, t_next: float
+    law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float
 ) -> tuple[Floats, Floats]:
     """Call the law within the step too, by the classical fourth-order method."""
-    model, buffer = law.robot.model, np.empty(law.size)
+    model, buffer, at_rest = law.robot.model, np.empty(law.size), np.zeros(law.robot.n_joints)
 
     def velocity(stage: Floats, ahead: float) -> Floats:
-        law.evaluate(stage, *reference(t + ahead), buffer, pace=pace(t + ahead), time=t + ahead)
+        now = t + ahead
+        wanted = demand.protected_rate(now)
+        law.evaluate(stage, *demand.reference(now), buffer, at_rest, wanted, demand.pace(now), now)
         return buffer[: model.nv].copy()
 
     return munthe_kaas(model, q, values[: model.nv], t_next - t, velocity)
