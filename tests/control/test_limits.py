@@ -36,8 +36,9 @@ class Matrices:
         return np.linalg.pinv(self.J @ self.N, rcond=1e-8) @ v
 
     def turning(self, wanted: np.ndarray, v: np.ndarray) -> np.ndarray:
-        fixed = np.linalg.pinv(self.J_sub) @ wanted
-        return fixed + self.plain(v - self.J @ fixed)
+        inverse = np.linalg.pinv(self.J_sub)
+        rates = inverse @ wanted + self.plain(v - self.J @ (inverse @ wanted))
+        return rates - inverse @ (self.J_sub @ rates - wanted)
 
 
 def call(step: LimitedStep, at: Matrices, v, previous=None, wanted=None, rho=0.0, **more) -> LimitedRates:
@@ -89,7 +90,7 @@ def test_plain_rates_inside_all_limits_stay_as_they_are(acceleration):
     at = Matrices(robot, Protection("yaw"), robot.configuration(START))
     v = np.array([0.001, -0.002, 0.001])
     result = call(step, at, v)
-    np.testing.assert_array_equal(result.joint_rates, at.plain(v))
+    np.testing.assert_array_equal(result.joint_rates, at.turning(np.zeros(1), v))
     assert (result.active, result.outside, result.excess, result.share) == ((), (), 0.0, 1.0)
 
 

@@ -15,7 +15,9 @@ def slew(time):
     return [TURN, -0.5 * TURN] @ np.diag([x * x * (1.0 - x) ** 2] * 2)
 
 
-@pytest.mark.parametrize(("method", "nodes", "tolerance"), [("rk4", 0, 1e-10), ("held", 2, 1e-8), ("explicit", 0, 1e-6)])
+@pytest.mark.parametrize(
+    ("method", "nodes", "tolerance"), [("rk4", 0, 1e-10), ("held", 2, 1e-8), ("explicit", 0, 1e-6)]
+)
 def test_the_base_turns_as_it_is_asked_to(ets_vii, method, nodes, tolerance):
     law = ssm.SelectiveLaw(ets_vii, ssm.Protection("roll+yaw"), sample_time=0.1, hold_nodes=nodes)
     q = ets_vii.configuration(START)

@@ -26,7 +26,8 @@ KINDS = {
 }
 # DAQP's defaults let a bound be passed by 1e-6.
 TOLERANCES = {"primal_tol": 1e-12, "dual_tol": 1e-12, "iter_limit": 500}
-KEPT = 1e-9  # relative: an acceleration this far above its limit is rounding
+LEAST = 1e-11  # weight of the rates beside that of what exceeds the acceleration limits
+KEPT = 1e-7  # share of the acceleration limits that is left for rounding there
 
 
 @dataclass(frozen=True)
@@ -264,8 +265,7 @@ class LimitedStep:
         Args:
             positions: Joint positions (n,), rad or m.
             previous: The rates commanded before (n,), zeros from rest.
-            plain: The rates that do the tasks without limits (n,): the array itself is returned where they keep all
-                limits.
+            plain: The rates that do the tasks without limits (n,); this array is returned where it keeps all limits.
             J_sub: (k, n).
             wanted: What J_sub q_dot shall be (k,).
             levels: Tasks in strict priority, of each level J_l (m_l, n), v_l (m_l,) and rho_l: it minimises
@@ -396,7 +396,7 @@ class LimitedStep:
         first = int(told[kernel.RANK] - told[kernel.ASKED])
         basis, limited = table[kernel.BASIS + first : kernel.BASIS + n], np.isfinite(self._steps)
         d, scale = len(basis), float(self._steps[limited].max(initial=0.0)) or 1.0
-        steps, change = self._steps[limited] / scale, previous[limited] / scale
+        steps, change = (1.0 - KEPT) * self._steps[limited] / scale, previous[limited] / scale
         ones = np.eye(d + 1)[: int(told[kernel.ASKED])]
         A = np.block(
             [
@@ -409,8 +409,8 @@ class LimitedStep:
         endless = np.full(len(steps), 1e30)
         high = np.r_[high, change + steps, endless, [told[kernel.LENGTH] / scale] * len(ones)]
         low = np.r_[low, -endless, change - steps, [0.0] * len(ones)]
-        H = np.diag([*[1e-9] * d, 1.0])
-        f = np.r_[-1e-9 * (basis @ rates) / scale, 0.0]
+        H = np.diag([*[LEAST] * d, 1.0])
+        f = np.r_[-LEAST * (basis @ rates) / scale, 0.0]
         problem = _Problem(d + 1, len(high))
         problem.H, problem.f, problem.A = H, f, np.vstack([A, ones])
         problem.high, problem.low = np.clip(high, -1e30, 1e30), np.clip(low, -1e30, 1e30)
@@ -419,7 +419,7 @@ class LimitedStep:
         if y is not None:
             kernel.settle(buffers.given[1], table, buffers.factors, told, first, scale * y[:d], rates)
         excess = float(np.max(np.abs(rates - previous)[limited] / self._steps[limited], initial=0.0) - 1.0)
-        if excess > KEPT:
+        if excess > 0.0:
             table[kernel.HIGH], table[kernel.LOW] = table[kernel.HARD_HIGH], table[kernel.HARD_LOW]
             table[kernel.HIGH_KIND], table[kernel.LOW_KIND] = kernel.ACCELERATIONS, kernel.ACCELERATIONS
             return excess
