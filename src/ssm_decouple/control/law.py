@@ -240,26 +240,26 @@ class SelectiveLaw:
     Args:
         robot: The robot.
         protection: The directions about which the base must not turn.
-        tasks: What the arm shall do: one task or several; None is the end-effector's position, `PositionTask()`.
-        joint_weights: w of the joints (n,) in the norm sum w_j q_dot_j^2 that the rates minimise, and that damping
-            and its threshold act in. None is 1 for all but reaction wheels, which have (r / max_speed)^2, r being the
-            largest rate limit of the other joints: a wheel's full speed counts as much as theirs.
-        limits: How limits are kept. None scales the command as a whole, which brakes all joints for one that is at its
-            rate limit, knows no position limits and does not brake ahead. `Limits()` keeps position, rate and
-            acceleration limits and clearances joint by joint, inside null(J_sub), by quadratic programs: the tasks get
-            what is possible beside them, and the arm can always be braked in time.
-        momentum: On board (6,), [linear; angular about the centre of mass], kg m/s and kg m2/s, inertial axes; None
-            for none. It may be assigned later as `law.momentum`, for example when thrusters have changed it.
         gain: Tracking gain k_p, 1/s, of the tasks that name none.
         rate_limit: Largest joint rates, rad/s or m/s: one number, an array (n,), or None for the URDF's.
         damping: rho at a singularity, m2; 0 gives the Moore-Penrose inverse everywhere.
         damping_threshold: Smallest singular value, m, below which rho enters.
-        sample_time: How long a command is held, s; needed for the two that follow.
+        sample_time: How long a command is held, s; needed for the two that follow and for `limits`.
         hold_nodes: 0 poses the law at the sample, 1 to 3 on matrices averaged over the hold.
         acceleration_limit: Largest joint accelerations, rad/s2 or m/s2, from one command to the next: one number, an
             array (n,), or None. The rates are blended from the previous ones within null(J_sub). The protection comes
             first, then the rate limits: where they take more than the acceleration limit allows, it is exceeded and
-            the command's `rate_blend` is 0. The law does not brake ahead.
+            the command's `rate_blend` is 0. Without `limits` the law does not brake ahead.
+        tasks: What the arm shall do: one task or several; None is the end-effector's position, `PositionTask()`.
+        joint_weights: w of the joints (n,) in the norm sum w_j q_dot_j^2 that the rates minimise, and that damping
+            and its threshold act in. None is 1 for all but reaction wheels, which have (r / max_speed)^2, r being the
+            largest rate limit of the other joints: a wheel's full speed counts as much as theirs.
+        momentum: On board (6,), [linear; angular about the centre of mass], kg m/s and kg m2/s, inertial axes; None
+            for none. It may be assigned later as `law.momentum`, for example when thrusters have changed it.
+        limits: How limits are kept. None scales the command as a whole, which brakes all joints for one that is at its
+            rate limit, knows no position limits and does not brake ahead. `Limits()` keeps position, rate and
+            acceleration limits and clearances joint by joint, inside null(J_sub), by quadratic programs: the tasks get
+            what is possible beside them, and the arm can always be braked in time.
 
     Attributes:
         size: Length of the array that `evaluate` fills.
@@ -517,7 +517,8 @@ class SelectiveLaw:
                 rank for b, the nearest b that there is takes its place: the command's `protected_rate` tells.
             pace: In [0, 1], scales the time of the command but not b: gain, target velocity and rate limits times
                 pace, so that with b = 0 the command is pace times the plain one (damped as that is). Beside rates
-                J_sub^+ b the limits move from these, at pace 0, to the full ones, at pace 1.
+                J_sub^+ b the limits move from these, at pace 0, to the full ones, at pace 1. With `limits` it leaves
+                the joints' limits as they are: then acceleration limits make a start smooth.
             time: s; only a `ScheduledLaw` looks at it.
 
         Returns:

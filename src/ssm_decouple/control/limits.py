@@ -187,6 +187,7 @@ class _Buffers:
     sides: Floats
     factors: Floats
     told: Floats
+    sizes: Floats  # rows of each level
     given: tuple[Floats, ...] = ()  # positions, J_sub and rows of the step that is made
     problems: dict[tuple[int, int], _Problem] = field(default_factory=dict)
 
@@ -280,16 +281,39 @@ class LimitedStep:
         if rows is None or distances is None:
             rows, distances = self._no_rows
         J = levels[0][0] if len(levels) == 1 else np.concatenate([level[0] for level in levels])
-        shapes = (positions.shape, previous.shape, plain.shape, J_sub.shape, wanted.shape, J.shape, rows.shape)
-        key = (*shapes, distances.shape, *[len(level[1]) for level in levels])
+        key = (
+            positions.shape,
+            previous.shape,
+            plain.shape,
+            J_sub.shape,
+            wanted.shape,
+            J.shape,
+            rows.shape,
+            distances.shape,
+            *[len(level[1]) for level in levels],
+        )
         buffers = self._buffers.get(key)
         if buffers is None:
             buffers = self._buffers[key] = self._fitting(key)
-        table, told, fixed = buffers.table, buffers.told, (buffers.table, buffers.sides, buffers.factors, buffers.told)
-        sizes = np.array([float(len(level[1])) for level in levels])
+        table, told = buffers.table, buffers.told
         self._parameters[kernel.NOISE] = noise
-        given = (positions, previous, plain, J_sub, wanted, J, sizes, rows, distances)
-        status = kernel.prepare(self._columns, self._parameters, *given, *fixed)
+        status = kernel.prepare(
+            self._columns,
+            self._parameters,
+            positions,
+            previous,
+            plain,
+            J_sub,
+            wanted,
+            J,
+            buffers.sizes,
+            rows,
+            distances,
+            table,
+            buffers.sides,
+            buffers.factors,
+            told,
+        )
         if status == kernel.INSIDE:
             return LimitedRates(plain, self.robot.joint_names)
         if status == kernel.NOT_FINITE:
@@ -323,6 +347,7 @@ class LimitedStep:
             np.zeros((kernel.SIDES_SIZE, rows[0])),
             np.zeros((kernel.FACTORS_SIZE, max(k + m, 1))),
             np.zeros(kernel.COUNTS + len(sizes)),
+            np.array(sizes, dtype=float),
         )
 
     def _solve(self, buffers: _Buffers, levels: Sequence[Level], rates: Floats) -> None:

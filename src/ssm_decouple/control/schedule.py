@@ -310,6 +310,7 @@ class ScheduledLaw(SelectiveLaw):
         number, share = self.schedule.at(time, np.asarray(q))
         if share == 0.0:
             self.phases[number].evaluate(q, target, target_velocity, out, previous_rates, wanted[number], pace)
+            self.limited = self.phases[number].limited
             return
         self._checked_out(out)
         for phase, values in ((number, self._first), (number + 1, self._second)):
