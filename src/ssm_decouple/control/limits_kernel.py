@@ -110,6 +110,7 @@ STEADY = 1e-3
 FADE = 0.9
 STOPS = 1e-14  # rad or m: rounding of the way to rest
 ROUNDING = 1e-12  # of the QP solver's answer, in its units
+DEPENDENT = 1e-10  # a bound whose rest beside the others has less than this share of its square depends on them
 
 
 @compiled
@@ -907,3 +908,89 @@ def count_at_bounds(bounds: Floats, rates: Floats) -> int:
     for j in range(rates.shape[0]):
         count += rates[j] >= bounds[HIGH, j] - near or rates[j] <= bounds[LOW, j] + near
     return count
+
+
+@compiled
+def lower_factor(M: Floats, size: int, smallest: float, L: Floats) -> bool:
+    """Fill the Cholesky factor L of M (size, size); False where a pivot is not above a share of what stood there."""
+    for i in range(size):
+        for j in range(i + 1):
+            left = M[i, j]
+            for s in range(j):
+                left -= L[i, s] * L[j, s]
+            if i > j:
+                L[i, j] = left / L[j, j]
+            elif left > smallest * M[i, i]:
+                L[i, i] = np.sqrt(left)
+            else:
+                return False
+    return True
+
+
+@compiled
+def solve_lower(L: Floats, size: int, x: Floats) -> None:
+    """Replace x by L^-1 x."""
+    for i in range(size):
+        for s in range(i):
+            x[i] -= L[i, s] * x[s]
+        x[i] /= L[i, i]
+
+
+@compiled
+def solve_upper(L: Floats, size: int, x: Floats) -> None:
+    """Replace x by L^-T x."""
+    for i in range(size - 1, -1, -1):
+        for s in range(i + 1, size):
+            x[i] -= L[s, i] * x[s]
+        x[i] /= L[i, i]
+
+
+@compiled
+def solve_at(
+    H: Floats, f: Floats, A: Floats, high: Floats, low: Floats, active: Floats, work: Floats, y: Floats
+) -> bool:
+    """Fill the minimiser y (d,) of y^T H y / 2 + f^T y with low <= A y <= high, if it stands at the bounds `active`.
+
+    These (c,) are 1.0 for an upper bound, -1.0 for a lower one and 0.0 for neither. The problem is convex, so that what
+    meets the bounds and has multipliers of the right signs is the minimiser, by whatever way it was found; False
+    where these bounds are not the ones. `work` (3 d + 2, d) is overwritten.
+    """
+    d, count = f.shape[0], 0
+    L, B, G, w, pushes = work[:d], work[d : 2 * d], work[2 * d : 3 * d], work[3 * d], work[3 * d + 1]
+    if not lower_factor(H, d, EPS, L):
+        return False
+    for i in range(d):
+        w[i] = f[i]
+    solve_lower(L, d, w)
+    for i in range(A.shape[0]):  # in z = L^T y the objective is |z + w|^2 / 2
+        if active[i] != 0.0:
+            if count == d:
+                return False
+            for s in range(d):
+                B[count, s] = A[i, s]
+            solve_lower(L, d, B[count])
+            pushes[count] = -(high[i] if active[i] > 0.0 else low[i]) - dot(B[count], w)
+            count += 1
+    for i in range(count):
+        for j in range(i + 1):
+            G[i, j] = dot(B[i], B[j])
+    if not lower_factor(G, count, DEPENDENT, G):
+        return False
+    solve_lower(G, count, pushes)
+    solve_upper(G, count, pushes)
+    at = 0
+    for i in range(A.shape[0]):
+        if active[i] != 0.0:
+            if pushes[at] * active[i] < 0.0:
+                return False
+            at += 1
+    for s in range(d):
+        y[s] = -w[s]
+        for i in range(count):
+            y[s] -= pushes[i] * B[i, s]
+    solve_upper(L, d, y)
+    for i in range(A.shape[0]):
+        value = dot(A[i], y)
+        if not low[i] - ROUNDING <= value <= high[i] + ROUNDING:
+            return False
+    return True
