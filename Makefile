@@ -46,6 +46,7 @@ benchmarks: .venv/installed-dev
 	$(BIN)/python benchmarks/start_up.py
 	$(BIN)/python benchmarks/arms.py
 	$(BIN)/python benchmarks/exactness.py
+	$(BIN)/python benchmarks/batch.py
 
 clean:
 	rm -rf .venv .venv-wheel dist results

@@ -17,6 +17,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ssm_decouple import batch as batch
     from ssm_decouple.control.arrays import base_twist_map as base_twist_map
     from ssm_decouple.control.arrays import selective_rates as selective_rates
     from ssm_decouple.control.collision import Clearance as Clearance
@@ -126,10 +127,15 @@ _HOME = {
     "simulate": "simulation.simulate",
 }
 
-__all__ = ["__version__", *_HOME]
+# Modules that are public as a whole.
+_MODULES = ("batch",)
+
+__all__ = ["__version__", *_HOME, *_MODULES]
 
 
 def __getattr__(name: str) -> Any:
+    if name in _MODULES:
+        return import_module(f"ssm_decouple.{name}")
     if name not in _HOME:
         raise AttributeError(f"module 'ssm_decouple' has no attribute '{name}'")
     value = getattr(import_module(f"ssm_decouple.{_HOME[name]}"), name)

@@ -1406,3 +1406,68 @@ def rates_of(
     for j in range(n):
         q_dot[j] = out[6 + j]
     return status
+
+
+# For many configurations at once: the same law, row by row.
+
+
+def unlocked(function: F) -> F:
+    """Compile as `compiled` does; other Python threads go on while the function runs."""
+    njit: Any = partial(numba.njit, nogil=True, error_model="numpy")
+    try:
+        return cast(F, njit(cache=True)(function))
+    except RuntimeError:
+        return cast(F, njit()(function))
+
+
+@unlocked
+def solve_rows(
+    values: Floats,
+    U_c: Floats,
+    tasks: Floats,
+    columns: Floats,
+    parameters: Floats,
+    targets: Floats,
+    out: Floats,
+) -> None:
+    """Write the command of one task of position, at each row's matrices, into the rows of `out` (rows, law.size).
+
+    Everything stands in base axes. A row of `values` begins with J_base (6 n), J_gt (3 n) and the position of the
+    task's point (3); `targets` (rows, 3). What is not finite gives a row of NaN. The rest as for `selective_command`,
+    without momentum on board.
+    """
+    n = columns.shape[1]
+    matrices, drift, scratch, small = (
+        np.zeros((J_TASK + 3, n)),
+        np.zeros((J_TASK + 3, 1)),
+        np.empty((19, n)),
+        np.empty((14, 9)),
+    )
+    still, nothing, rates = np.zeros(3), np.zeros(n), np.zeros(3)
+    for row in range(values.shape[0]):
+        own, results = values[row], out[row, 6 + n :]
+        for b in range(6):
+            for j in range(n):
+                matrices[J_BASE + b, j] = own[b * n + j]
+        for r in range(3):
+            for j in range(n):
+                matrices[J_TASK + r, j] = own[(6 + r) * n + j]
+            results[POSITION + r] = own[9 * n + r]
+            results[ERRORS + r] = -own[9 * n + r]
+        status = solve(
+            matrices,
+            drift,
+            U_c,
+            tasks,
+            columns,
+            parameters,
+            targets[row],
+            still,
+            nothing,
+            out[row],
+            rates,
+            scratch,
+            small,
+        )
+        if status != OK:
+            out[row, :] = np.nan

@@ -15,6 +15,7 @@ from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_positive, as_seed
 from ssm_decouple.model.plant import Plant
 from ssm_decouple.model.robot import UNLIMITED, Robot
+from ssm_decouple.model.tree import Tree
 from ssm_decouple.simulation import physics
 from ssm_decouple.simulation.motion import flagged_spans, rotations_to, twist_along
 
@@ -173,25 +174,18 @@ def tree_of(model: pin.Model) -> tuple[NDArray[np.int64], Floats]:
     Raises:
         InputError: a joint with more than one degree of freedom, which URDFs do not have.
     """
-    N = model.nv - 6
-    parent, tree = np.zeros(N, dtype=np.int64), np.zeros((N + 1, physics.TREE_SIZE))
+    read = Tree.of(model)
+    tree = np.zeros((len(read.masses), physics.TREE_SIZE))
     tree[0, [0, 4, 8]] = 1.0
-    for i, joint in enumerate(model.joints[1:]):
-        inertia = model.inertias[joint.id]
-        tree[i, physics.BODY_MASS] = inertia.mass
-        tree[i, physics.CENTRE : physics.CENTRE + 3] = inertia.lever
-        tree[i, physics.INERTIA :] = np.array(inertia.inertia)[np.triu_indices(3)]
-        if i == 0:
-            continue
-        if joint.nv != 1:
-            raise InputError(f"joint '{model.names[joint.id]}' has {joint.nv} degrees of freedom; only 1 is supported")
-        placement, axis = model.jointPlacements[joint.id], np.ravel(joint.createData().S)
-        tree[i, :9], tree[i, 9:12] = placement.rotation.ravel(), placement.translation
-        revolute = np.any(axis[3:])
-        tree[i, physics.AXIS : physics.AXIS + 3] = axis[3:] if revolute else axis[:3]
-        tree[i, physics.PRISMATIC] = 0.0 if revolute else 1.0
-        parent[i - 1] = model.parents[joint.id] - 1
-    return parent, tree
+    tree[1:, : physics.TRANSLATION] = read.rotations.reshape(-1, 9)
+    tree[1:, physics.TRANSLATION : physics.AXIS] = read.translations
+    tree[1:, physics.AXIS : physics.PRISMATIC] = read.axes
+    tree[1:, physics.PRISMATIC] = read.slides
+    tree[:, physics.BODY_MASS] = read.masses
+    tree[:, physics.CENTRE : physics.INERTIA] = read.centres
+    rows, columns = np.triu_indices(3)
+    tree[:, physics.INERTIA :] = read.inertias[:, rows, columns]
+    return read.parents, tree
 
 
 class DynamicMotion:

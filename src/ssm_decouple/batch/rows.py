@@ -1,0 +1,137 @@
+"""The compiled motion of many robots at once, row by row: poses, steps and what is kept of them.
+
+Why one file: Numba keeps compiled code on disk and watches only the file that a function stands in.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ssm_decouple.control.kernel import compiled, unlocked
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    Floats = NDArray[np.float64]
+
+# What is kept of a motion, a row each.
+TRAVEL = 0  # integral of the joint rates' norm
+PEAK = 1  # largest joint rate
+SMALLEST = 2  # smallest singular value
+LOWEST = 3  # 3: roll, pitch and yaw at their lowest
+HIGHEST = 6  # 3: at their highest
+RECORD_SIZE = 9
+
+
+@compiled
+def turn_back(pose: Floats, point: Floats, out: Floats) -> None:
+    """Fill a point (3,), given in inertial axes and from their origin, as seen from a pose (7,): position, x y z w."""
+    x, y, z, w = -pose[3], -pose[4], -pose[5], pose[6]
+    a, b, c = point[0] - pose[0], point[1] - pose[1], point[2] - pose[2]
+    u, v, t = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
+    out[0] = a + w * u + y * t - z * v
+    out[1] = b + w * v + z * u - x * t
+    out[2] = c + w * t + x * v - y * u
+
+
+@compiled
+def move_pose(pose: Floats, twist: Floats, time: float) -> None:
+    """Move a pose (7,) by a twist (6,) in its own axes that is held for a time: the exponential map of SE(3)."""
+    vx, vy, vz = time * twist[0], time * twist[1], time * twist[2]
+    wx, wy, wz = time * twist[3], time * twist[4], time * twist[5]
+    square = wx * wx + wy * wy + wz * wz
+    angle = np.sqrt(square)
+    half = 0.5 * angle
+    if angle > 0.1:
+        sinc = np.sin(half) / half
+        second = (1.0 - np.sin(angle) / angle) / square
+    else:
+        quarter = half * half
+        sinc = 1.0 - quarter / 6.0 * (1.0 - quarter / 20.0 * (1.0 - quarter / 42.0 * (1.0 - quarter / 72.0)))
+        second = (1.0 - square / 20.0 * (1.0 - square / 42.0 * (1.0 - square / 72.0))) / 6.0
+    first = 0.5 * sinc * sinc
+    ax, ay, az = wy * vz - wz * vy, wz * vx - wx * vz, wx * vy - wy * vx
+    along = wx * vx + wy * vy + wz * vz
+    # w x (w x v) = w (w v) - v |w|^2
+    mx = vx + first * ax + second * (wx * along - vx * square)
+    my = vy + first * ay + second * (wy * along - vy * square)
+    mz = vz + first * az + second * (wz * along - vz * square)
+    x, y, z, w = pose[3], pose[4], pose[5], pose[6]
+    u, v, t = 2.0 * (y * mz - z * my), 2.0 * (z * mx - x * mz), 2.0 * (x * my - y * mx)
+    pose[0] += mx + w * u + y * t - z * v
+    pose[1] += my + w * v + z * u - x * t
+    pose[2] += mz + w * t + x * v - y * u
+    s, c = 0.5 * sinc, np.cos(half)
+    a, b, d = s * wx, s * wy, s * wz
+    x, y, z, w = (
+        w * a + x * c + y * d - z * b,
+        w * b + y * c + z * a - x * d,
+        w * d + z * c + x * b - y * a,
+        w * c - x * a - y * b - z * d,
+    )
+    # Of the two signs the one nearer to the quaternion before, as Pinocchio has it.
+    size = (1.0 if c >= 0.0 else -1.0) / np.sqrt(x * x + y * y + z * z + w * w)
+    pose[3], pose[4], pose[5], pose[6] = size * x, size * y, size * z, size * w
+
+
+@compiled
+def keep_attitude(pose: Floats, record: Floats) -> None:
+    """Widen the ranges of roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), to hold those of a pose."""
+    x, y, z, w = pose[3], pose[4], pose[5], pose[6]
+    roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = np.arcsin(min(max(2.0 * (w * y - z * x), -1.0), 1.0))
+    yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    for i, angle in enumerate((roll, pitch, yaw)):
+        record[LOWEST + i] = min(record[LOWEST + i], angle)
+        record[HIGHEST + i] = max(record[HIGHEST + i], angle)
+
+
+@unlocked
+def see_targets(poses: Floats, targets: Floats, seen: Floats) -> None:
+    """Fill the targets (rows, 3), inertial axes, as seen from the base poses (rows, 7)."""
+    for row in range(poses.shape[0]):
+        turn_back(poses[row], targets[row], seen[row])
+
+
+@unlocked
+def advance(
+    commands: Floats,
+    smallest: int,
+    errors: int,
+    time: float,
+    joints: Floats,
+    poses: Floats,
+    record: Floats,
+    history: Floats,
+) -> None:
+    """Keep what a sample tells of each motion, then hold its rates and its base twist for a time.
+
+    Args:
+        commands: What the law commands (rows, law.size).
+        smallest: Where the smallest singular value stands in it.
+        errors: Where the error of the position (3) stands.
+        time: For how long it is held, s; 0 at the last sample.
+        joints: Joint positions (rows, n), moved.
+        poses: Base poses (rows, 7), moved.
+        record: (rows, RECORD_SIZE), brought up to date.
+        history: The distance to the target at this sample (rows,), overwritten.
+    """
+    n = joints.shape[1]
+    for row in range(joints.shape[0]):
+        command, kept = commands[row], record[row]
+        distance, square = 0.0, 0.0
+        for r in range(3):
+            distance += command[errors + r] ** 2
+        history[row] = np.sqrt(distance)
+        for j in range(n):
+            rate = command[6 + j]
+            square += rate * rate
+            kept[PEAK] = max(kept[PEAK], abs(rate))
+            joints[row, j] += time * rate
+        kept[TRAVEL] += time * np.sqrt(square)
+        kept[SMALLEST] = min(kept[SMALLEST], command[smallest])
+        keep_attitude(poses[row], kept)
+        if time > 0.0:
+            move_pose(poses[row], command, time)
