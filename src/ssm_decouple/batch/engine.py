@@ -20,9 +20,11 @@ from ssm_decouple.control.schedule import ScheduledLaw
 from ssm_decouple.errors import InputError, as_floats, as_positive
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.simulation.steps import sample_times
 
 Floats = NDArray[np.float64]
 Progress = Callable[[float], object]
+LawConstants = tuple[Floats, Floats, Floats, Floats]  # of `SelectiveLaw.constants`
 
 CONFIGURATIONS = 8192  # that a thread works on at a time
 MOTIONS = 256  # likewise: their matrices stay in the processor's cache
@@ -130,13 +132,13 @@ class Batch:
             InputError: another law, shapes that do not fit, or a base quaternion that is not of unit length.
         """
         joints, poses, wanted = self._starts(law, configurations, targets)
-        out = np.empty((len(joints), law.size))
+        out, constants = np.empty((len(joints), law.size)), law.constants()
 
         def work(start: int, end: int) -> None:
             part = slice(start, end)
             seen, values = np.empty((end - start, 3)), self._row_values(end - start)
             rows.see_targets(poses[part], wanted[part], seen)
-            self._command(_LawConstants(law), joints[part], seen, values, out[part])
+            self._command(constants, joints[part], seen, values, out[part])
 
         _spread(len(joints), CONFIGURATIONS, self.threads, work)
         commands = Commands(out, self.robot.n_joints, law.protection.k)
@@ -169,10 +171,10 @@ class Batch:
         Raises:
             InputError: another law, shapes that do not fit, or times that make no sense.
         """
-        times = _sample_times(as_positive("duration", duration), as_positive("dt", dt))
+        times = sample_times(as_positive("duration", duration), as_positive("dt", dt))
         tolerance = as_positive("arrival_tolerance", arrival_tolerance)
         joints, poses, wanted = self._starts(law, starts, targets)
-        N, constants = len(joints), _LawConstants(law)
+        N, constants = len(joints), law.constants()
         record, errors = np.empty((N, rows.RECORD_SIZE)), np.empty(N)
         outcomes: NDArray[np.str_] = np.full(N, "undefined", dtype="<U9")
         outcome_times: Floats = np.full(N, np.nan)
@@ -180,7 +182,9 @@ class Batch:
 
         def work(start: int, end: int) -> None:
             part = slice(start, end)
-            history = self._move(constants, joints[part], poses[part], wanted[part], times, record[part], stop)
+            history = self._move(
+                constants, law.size, joints[part], poses[part], wanted[part], times, record[part], stop
+            )
             errors[part] = history[:, -1]
             _judge(times, history, tolerance, 1.0 / law.gain, outcomes[part], outcome_times[part])
 
@@ -218,14 +222,15 @@ class Batch:
     def _row_values(self, count: int) -> Floats:
         return np.empty((count, 12 * self.robot.n_joints + lanes.SINGLES))
 
-    def _command(self, law: _LawConstants, joints: Floats, seen: Floats, values: Floats, out: Floats) -> None:
+    def _command(self, law: LawConstants, joints: Floats, seen: Floats, values: Floats, out: Floats) -> None:
         """Write what the law commands at joint positions, targets being seen from the base, into `out`."""
         lanes.evaluate(*self._constants, joints, *_packed(()), values, np.empty((len(joints), 0)), NO_ROWS)
-        kernel.solve_rows(values, *law.arrays, seen, out)
+        kernel.solve_rows(values, *law, seen, out)
 
     def _move(
         self,
-        law: _LawConstants,
+        law: LawConstants,
+        size: int,
         joints: Floats,
         poses: Floats,
         targets: Floats,
@@ -234,7 +239,7 @@ class Batch:
         stop: Event,
     ) -> Floats:
         """Move joints and poses to the end of the motion; return the distances to the targets (rows, samples)."""
-        count, size = len(joints), law.size
+        count = len(joints)
         values, out, seen = self._row_values(count), np.empty((count, size)), np.empty((count, 3))
         history = np.empty((times.size, count))
         record[:] = 0.0
@@ -338,24 +343,6 @@ class Batch:
                 )
 
 
-class _LawConstants:
-    """What the kernel reads of a law."""
-
-    def __init__(self, law: SelectiveLaw) -> None:
-        n = law.robot.n_joints
-        columns = np.zeros((kernel.MOVES + 1, n))
-        columns[kernel.RATE_LIMIT] = law.rate_limits
-        columns[kernel.RATE_STEP] = np.inf
-        columns[kernel.SCALE] = 1.0 / np.sqrt(law.joint_weights)
-        columns[kernel.MOVES] = law.layout.moves[0]
-        parameters = np.zeros(kernel.PARAMETERS_SIZE)
-        parameters[kernel.THRESHOLD], parameters[kernel.DAMPING_LIMIT] = law.damping_threshold, law.damping
-        parameters[kernel.AXES_JOINT], parameters[kernel.PACE] = -1.0, 1.0
-        parameters[kernel.TASK_ROWS], parameters[kernel.LEVELS] = law.layout.size, 1.0
-        self.size = law.size
-        self.arrays = (law.protection.U_twist.copy(), law.layout.table, columns, parameters)
-
-
 def _packed(protections: Sequence[Protection | str]) -> tuple[Floats, NDArray[np.int64], NDArray[np.int64]]:
     """Return directions, counts and first rows as `lanes.evaluate` wants them."""
     if isinstance(protections, (str, Protection)):
@@ -403,14 +390,6 @@ def _spread(
                 stop.set()
             pool.shutdown(cancel_futures=True)
             raise
-
-
-def _sample_times(duration: float, dt: float) -> Floats:
-    if dt > duration:
-        raise InputError(f"dt is {dt:g} s, longer than the duration of {duration:g} s")
-    times = dt * np.arange(int(np.ceil(duration / dt * (1 - 1e-12))) + 1, dtype=np.float64)
-    times[-1] = duration
-    return times
 
 
 def _judge(

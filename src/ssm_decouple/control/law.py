@@ -5,20 +5,21 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.control.collision import Distances
-from ssm_decouple.control.limits import LimitedRates, LimitedStep, Limits
 from ssm_decouple.control.task import Layout, PositionTask, Task, checked_tasks
 from ssm_decouple.errors import DecoupleWarning, InputError, as_floats
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.model.robot import Robot, per_joint
 from ssm_decouple.momentum.flow import munthe_kaas
 from ssm_decouple.momentum.protection import Protection
+
+if TYPE_CHECKING:
+    from ssm_decouple.control.limits import LimitedRates, LimitedStep, Limits
 
 Floats = NDArray[np.float64]
 
@@ -309,14 +310,16 @@ class SelectiveLaw:
         self.damping_threshold = _positive("damping_threshold", damping_threshold)
         self.sample_time = None if sample_time is None else _positive("sample_time", sample_time)
         self.hold_nodes = hold_nodes
-        self.rate_limits: Floats = _limits(robot, "rate_limit", robot.rate_limits if rate_limit is None else rate_limit)
+        self.rate_limits: Floats = per_joint(
+            robot, "rate_limit", robot.rate_limits if rate_limit is None else rate_limit
+        )
         self.acceleration_limits: Floats | None = None
         if acceleration_limit is not None:
-            self.acceleration_limits = _limits(robot, "acceleration_limit", acceleration_limit)
+            self.acceleration_limits = per_joint(robot, "acceleration_limit", acceleration_limit)
         self.joint_weights: Floats = (
             _default_weights(robot, self.rate_limits)
             if joint_weights is None
-            else _per_joint(robot, "joint_weights", joint_weights, "finite")
+            else per_joint(robot, "joint_weights", joint_weights, "finite")
         )
         self.tasks = (PositionTask(),) if tasks is None else checked_tasks(robot, tasks)
         self.layout = Layout(robot, self.tasks, self.gain)
@@ -348,16 +351,13 @@ class SelectiveLaw:
     @property
     def momentum(self) -> Floats:
         """Momentum on board (6,): [linear; angular about the centre of mass], kg m/s and kg m2/s, inertial axes."""
-        return self._momentum()
+        momentum: Floats = self._prepared[3][3][kernel.MOMENTUM :].copy()
+        momentum.flags.writeable = False
+        return momentum
 
     @momentum.setter
     def momentum(self, momentum: ArrayLike | None) -> None:
         self._set_momentum(momentum)
-
-    def _momentum(self) -> Floats:
-        momentum: Floats = self._prepared[3][3][kernel.MOMENTUM :].copy()
-        momentum.flags.writeable = False
-        return momentum
 
     def _set_momentum(self, momentum: ArrayLike | None) -> None:
         values = np.zeros(6) if momentum is None else as_floats("momentum", momentum)
@@ -464,6 +464,10 @@ class SelectiveLaw:
 
     def _prepare_limits(self, limits: Limits) -> None:
         """Let the kernel give rates without limits, to be brought inside them afterwards."""
+        # Who has no such limits does not wait for the solver and the collision library.
+        from ssm_decouple.control.collision import Distances
+        from ssm_decouple.control.limits import LimitedStep
+
         layout, scale = self.layout, 1.0 / np.sqrt(self.joint_weights)
         _, _, _, (_, _, columns, parameters), _ = self._prepared
         columns[kernel.RATE_LIMIT], parameters[kernel.LIMITS_STEPS] = np.inf, 0.0
@@ -482,6 +486,11 @@ class SelectiveLaw:
         self._sides: Floats = np.zeros(self._k + layout.size + 1)
         self._places = [slice(self._k + rows.start, self._k + rows.stop) for rows in layout.level_rows]
         self._rhos = [kernel.ERRORS + layout.size + 2 * level + 1 for level in range(len(layout.level_rows))]
+
+    def constants(self) -> tuple[Floats, Floats, Floats, Floats]:
+        """Return copies of what the kernel reads of the law: U_c, tasks, columns and parameters."""
+        U_c, tasks, columns, parameters = self._prepared[3]
+        return U_c.copy(), tasks.copy(), columns.copy(), parameters.copy()
 
     def _protected_axes(self) -> tuple[float, Floats]:
         """Return the joint in whose axes the protected directions are fixed, by the kernel's numbers, and U_c there."""
@@ -535,7 +544,7 @@ class SelectiveLaw:
         if target_velocity is None:
             target_velocity = self._at_rest
         values = np.empty(self.size)
-        self.evaluate(q, target, target_velocity, values, previous_rates, protected_rate, pace)
+        self.evaluate(q, target, target_velocity, values, previous_rates, protected_rate, pace, time)
         return Command(values, self._n, self._k, self.layout)
 
     def evaluate(
@@ -908,19 +917,6 @@ def _vector(name: str, value: ArrayLike) -> Floats:
     if vector.shape != (3,):
         raise InputError(f"{name} has shape {vector.shape}; it needs 3 numbers, m or m/s in inertial axes")
     return vector
-
-
-def _limits(robot: Robot, name: str, given: ArrayLike) -> Floats:
-    return _per_joint(robot, name, given, "infinity for no limit")
-
-
-def _per_joint(robot: Robot, name: str, given: ArrayLike, infinity: str) -> Floats:
-    values = as_floats(name, given)
-    if values.shape not in ((), (robot.n_joints,)):
-        raise InputError(f"{name} has shape {values.shape}; give one number or one for each of {robot.n_joints} joints")
-    if not np.all(values > 0) or (infinity == "finite" and not np.all(np.isfinite(values))):
-        raise InputError(f"{name} is {given!r}; every joint's must be above zero ({infinity})")
-    return np.broadcast_to(values, (robot.n_joints,)).copy()
 
 
 def _default_weights(robot: Robot, rate_limits: Floats) -> Floats:

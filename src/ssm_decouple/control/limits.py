@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ssm_decouple.control import limits_kernel as kernel
 from ssm_decouple.control.collision import Clearance
 from ssm_decouple.errors import InputError, as_floats, as_positive
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.model.robot import Robot, per_joint
 
 Floats = NDArray[np.float64]
 Level = tuple[Floats, Floats, float]  # J_l (m_l, n), v_l (m_l,), rho_l
@@ -247,9 +247,9 @@ class LimitedStep:
         position = limits.positions(robot)
         columns = np.empty((kernel.COLUMNS_SIZE, n))
         columns[kernel.LOWER], columns[kernel.UPPER] = position[:, 0], position[:, 1]
-        columns[kernel.RATE] = _limits(robot, "rate_limits", rate_limits)
+        columns[kernel.RATE] = per_joint(robot, "rate_limits", rate_limits)
         accelerations = np.inf if acceleration_limits is None else acceleration_limits
-        columns[kernel.ACCELERATION] = _limits(robot, "acceleration_limits", accelerations)
+        columns[kernel.ACCELERATION] = per_joint(robot, "acceleration_limits", accelerations)
         distance = 0.0 if limits.clearance is None else limits.clearance.distance
         self.robot = robot
         self.limits = limits
@@ -464,12 +464,3 @@ class LimitedStep:
         given = (self._columns, self._parameters, buffers.given[0], previous, buffers.given[2])
         kernel.fill_bounds(*given, table, buffers.sides, told)
         return 0.0
-
-
-def _limits(robot: Robot, name: str, given: ArrayLike) -> Floats:
-    limits = as_floats(name, given)
-    if limits.shape not in ((), (robot.n_joints,)):
-        raise InputError(f"{name} has shape {limits.shape}; give one number or one for each of {robot.n_joints} joints")
-    if not np.all(limits > 0):
-        raise InputError(f"{name} is {given!r}; every joint's must be above zero (infinity for no limit)")
-    return np.broadcast_to(limits, (robot.n_joints,)).copy()

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.control.law import Command, LostDirection, SelectiveLaw
-from ssm_decouple.control.task import Piece, Task
+from ssm_decouple.control.law import LostDirection, SelectiveLaw
+from ssm_decouple.control.task import RateTask
 from ssm_decouple.errors import InputError, as_floats, as_positive
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
@@ -168,25 +168,12 @@ def _place(found: list[Floats], column: Floats) -> int:
 
 
 @dataclass(frozen=True)
-class _GivenRates(Task):
-    """Joint rates as near to given ones, its target's velocity (n,), as the protection lets them be."""
+class _GivenRates(RateTask):
+    """Joint rates as near to given ones as the protection lets them be."""
 
     gain: float | None = None
     weight: float = 1.0
     level: int = 1
-    takes_target: ClassVar[bool] = False
-
-    def pieces(self, robot: Robot) -> list[Piece]:
-        return [Piece(kernel.CLIMBS, robot.joint_names, np.arange(1.0, robot.n_joints + 1))]
-
-    def flat_target(self, robot: Robot, target: Any) -> Floats:
-        return np.zeros(0)
-
-    def sizes(self, robot: Robot) -> tuple[int, int]:
-        return 0, robot.n_joints
-
-    def owner(self, robot: Robot) -> str:
-        return "joint"
 
 
 class ScheduledLaw(SelectiveLaw):
@@ -228,7 +215,6 @@ class ScheduledLaw(SelectiveLaw):
         self._bridges = tuple(SelectiveLaw(robot, schedule.shared(i), **follow) for i in range(count))
         self._first, self._second = np.empty(self.size), np.empty(self.size)
         self._bridged = np.empty(self._bridges[0].size)
-        self.momentum = self.momentum
 
     @property
     def directions(self) -> tuple[Floats, str]:
@@ -241,10 +227,6 @@ class ScheduledLaw(SelectiveLaw):
         told = [schedule.shares(*schedule.at(t, q)) for t, q in zip(time.tolist(), configurations, strict=True)]
         return np.array(told).reshape(len(time), schedule.k)
 
-    def check_start(self, q: ArrayLike) -> None:
-        """Look at a start configuration, as `SelectiveLaw.check_start` does."""
-        self.phases[0].check_start(q)
-
     def lost_direction(self, q: ArrayLike) -> LostDirection:
         """Refuse: it is a matter of one protection.
 
@@ -253,42 +235,11 @@ class ScheduledLaw(SelectiveLaw):
         """
         raise InputError("each protection of a schedule loses its own direction: ask law.phases[i].lost_direction(q)")
 
-    @property
-    def momentum(self) -> Floats:
-        """Momentum on board (6,), as for `SelectiveLaw`."""
-        return self._momentum()
-
-    @momentum.setter
-    def momentum(self, momentum: ArrayLike | None) -> None:
-        self._set_momentum(momentum)
+    def _set_momentum(self, momentum: ArrayLike | None) -> None:
+        super()._set_momentum(momentum)
         if self.phases:  # not while the first of them is made
             for law in (*self.phases, *self._free, *self._bridges):
-                law.momentum = self._momentum()
-
-    def __call__(
-        self,
-        q: ArrayLike,
-        target: Any,
-        target_velocity: Any = None,
-        previous_rates: ArrayLike | None = None,
-        protected_rate: ArrayLike | None = None,
-        pace: float = 1.0,
-        time: float = 0.0,
-    ) -> Command:
-        """Return the command at a configuration and a time, s; `protected_rate` has a number for each of the K rows.
-
-        During a hand-over the command's own `protected_rate` is that of the rows which both protections have.
-
-        Raises:
-            InputError: as for `SelectiveLaw`.
-        """
-        values = np.empty(self.size)
-        targets = self.layout.flat_targets(target)
-        velocities = self.layout.flat_velocities(target_velocity)
-        self.evaluate(q, targets, velocities, values, previous_rates, protected_rate, pace, time)
-        number, share = self.schedule.at(time, np.asarray(q))
-        current = self.phases[number] if share == 0.0 else self._bridges[number]
-        return Command(values, self._n, current.protection.k, self.layout)
+                law.momentum = self.momentum
 
     def evaluate(
         self,
@@ -301,16 +252,19 @@ class ScheduledLaw(SelectiveLaw):
         pace: float = 1.0,
         time: float = 0.0,
     ) -> None:
-        """Compute a command into an array, as `SelectiveLaw.evaluate` does.
+        """Compute a command into an array, as `SelectiveLaw.evaluate` does; the call does the same.
+
+        `protected_rate` has a number for each of the K rows. During a hand-over the command's own is that of the rows
+        which both protections have.
 
         Raises:
-            InputError: as for the call.
+            InputError: as for `SelectiveLaw`.
         """
         wanted = self._rows_of_each(protected_rate)
         number, share = self.schedule.at(time, np.asarray(q))
         if share == 0.0:
             self.phases[number].evaluate(q, target, target_velocity, out, previous_rates, wanted[number], pace)
-            self.limited = self.phases[number].limited
+            self.limited, self._k = self.phases[number].limited, self.phases[number].protection.k
             return
         self._checked_out(out)
         for phase, values in ((number, self._first), (number + 1, self._second)):
@@ -324,7 +278,7 @@ class ScheduledLaw(SelectiveLaw):
         for kept in _OF_THE_BRIDGE:
             out[6 + n :][kept] = bridged[6 + n :][kept]
         out[6 + n + kernel.RATE_SCALE] = min(part[6 + n + kernel.RATE_SCALE] for part in (first, second, bridged))
-        self.limited = bridge.limited
+        self.limited, self._k = bridge.limited, bridge.protection.k
 
     def _rows_of_each(self, protected_rate: ArrayLike | None) -> list[Floats | None]:
         if protected_rate is None:

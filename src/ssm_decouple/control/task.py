@@ -335,8 +335,30 @@ class PostureTask(Task):
         return "joint"
 
 
+class RateTask(Task):
+    """What the tasks share that ask for joint rates themselves: a row a joint, no target, and the rates as velocity."""
+
+    takes_target: ClassVar[bool] = False
+
+    def pieces(self, robot: Robot) -> list[Piece]:
+        """Return a row a joint."""
+        return [Piece(kernel.CLIMBS, robot.joint_names, np.arange(1.0, robot.n_joints + 1))]
+
+    def flat_target(self, robot: Robot, target: Any) -> Floats:
+        """Return nothing."""
+        return np.zeros(0)
+
+    def sizes(self, robot: Robot) -> tuple[int, int]:
+        """Return nothing for the target and a rate a joint."""
+        return 0, robot.n_joints
+
+    def owner(self, robot: Robot) -> str:
+        """Return the word for rows that name their joint themselves."""
+        return "joint"
+
+
 @dataclass(frozen=True)
-class ManipulabilityTask(Task):
+class ManipulabilityTask(RateTask):
     """Move the joints to where the tasks of level 1 have more freedom, with what the levels before leave.
 
     The joint rates asked for are the gain times the gradient of log w, w the product of the singular values of J_1
@@ -348,28 +370,11 @@ class ManipulabilityTask(Task):
     gain: float | None = None
     weight: float = 1.0
     level: int = 2
-    takes_target: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.level == 1:
             raise InputError("a manipulability task serves those of level 1, so its level is 2 or more")
-
-    def pieces(self, robot: Robot) -> list[Piece]:
-        """Return a row a joint."""
-        return [Piece(kernel.CLIMBS, robot.joint_names, np.arange(1.0, robot.n_joints + 1))]
-
-    def flat_target(self, robot: Robot, target: Any) -> Floats:
-        """Return nothing."""
-        return np.zeros(0)
-
-    def sizes(self, robot: Robot) -> tuple[int, int]:
-        """Return nothing for the target and a rate a joint, which the law fills."""
-        return 0, robot.n_joints
-
-    def owner(self, robot: Robot) -> str:
-        """Return the word for rows that name their joint themselves."""
-        return "joint"
 
 
 class Layout:

@@ -439,3 +439,18 @@ def rigid_pose(name: str, pose: pin.SE3 | ArrayLike) -> pin.SE3:
             f"{name} is no rigid pose: its rotation needs right-handed orthonormal columns, its last row 0 0 0 1"
         )
     return pin.SE3(rotation, matrix[:3, 3])
+
+
+def per_joint(robot: Robot, name: str, given: ArrayLike, infinity: str = "infinity for no limit") -> Floats:
+    """Return numbers above zero (n,), from one for all joints or one for each.
+
+    Raises:
+        InputError: they do not fit; the message calls them `name`. `infinity` says what infinity means, "finite" that
+            it is none of them.
+    """
+    values = as_floats(name, given)
+    if values.shape not in ((), (robot.n_joints,)):
+        raise InputError(f"{name} has shape {values.shape}; give one number or one for each of {robot.n_joints} joints")
+    if not np.all(values > 0) or (infinity == "finite" and not np.all(np.isfinite(values))):
+        raise InputError(f"{name} is {given!r}; every joint's must be above zero ({infinity})")
+    return np.broadcast_to(values, (robot.n_joints,)).copy()

@@ -12,6 +12,7 @@ import xarray as xr
 from numpy.typing import NDArray
 
 from ssm_decouple.control.law import SelectiveLaw
+from ssm_decouple.control.schedule import ScheduledLaw
 from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_positive, as_seed
 from ssm_decouple.model.plant import Plant
 from ssm_decouple.model.robot import UNLIMITED, Robot
@@ -232,7 +233,7 @@ class DynamicMotion:
         self._limits = _torque_limits(robot, settings.servo)
         joints = np.vstack([self.plant.stiffness, self.plant.damping])
         protects = settings.servo is not None and settings.servo.protects
-        if protects and (self.axes not in ("base", "inertial") or law.shares(np.zeros(1), q[None]) is not None):
+        if protects and (self.axes not in ("base", "inertial") or isinstance(law, ScheduledLaw)):
             raise InputError(
                 "a servo that protects holds one protection, fixed in base or inertial axes: no schedule and no axes "
                 f"of '{self.axes}'"
@@ -448,7 +449,7 @@ def _refuse_unfit_feedback(settings: Dynamic, law: SelectiveLaw, dt: float) -> N
             f"feedback_gain is {settings.feedback_gain:g} 1/s, with {dt:g} s between samples it overshoots: use "
             f"{1 / dt:.3g} 1/s or less"
         )
-    if settings.feedback_gain and law.shares(np.zeros(1), np.zeros((1, law.robot.model.nq))) is not None:
+    if settings.feedback_gain and isinstance(law, ScheduledLaw):
         raise InputError("feedback_gain takes back what one protection has lost; a schedule has several: leave it out")
     if settings.feedback_gain and np.any(law.protection.U_twist[:3]):
         raise InputError(

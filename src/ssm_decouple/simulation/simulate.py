@@ -17,15 +17,12 @@ from ssm_decouple.control.schedule import ScheduledLaw
 from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_floats, as_not_negative, as_triple
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import build_motion, error_of, judge
-from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted
+from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted, sample_times
 
 Floats = NDArray[np.float64]
 Method = Literal["explicit", "held", "rk4"]
 Target = Callable[[float], tuple[Any, Any]]
 Progress = Callable[[float], object]
-
-
-MOST_STEPS = 1e8  # a record of more would not fit into memory
 
 
 class SimulationInterrupted(KeyboardInterrupt):
@@ -104,7 +101,7 @@ def simulate(
         DivergenceError: the numbers of a dynamic simulation run away; it carries the motion until then.
         SimulationInterrupted: Ctrl-C; it is a KeyboardInterrupt and carries the motion so far.
     """
-    time = _sample_times(duration, dt)
+    time = sample_times(duration, dt)
     if not isinstance(method, Dynamic) and method not in STEPS:
         raise InputError(f"method '{method}' is unknown: use {', '.join(STEPS)} or a Dynamic")
     _refuse_unfit_method(law, method, duration, dt)
@@ -240,20 +237,6 @@ def _smooth_pace(duration: float) -> Pace:
         return float(x**3 * (10.0 - 15.0 * x + 6.0 * x**2))
 
     return pace
-
-
-def _sample_times(duration: float, dt: float) -> Floats:
-    for name, value in (("dt", dt), ("duration", duration)):
-        if not (np.isfinite(value) and value > 0):
-            raise InputError(f"{name} is {value}; it must be a positive time, s")
-    if dt > duration:
-        raise InputError(f"dt is {dt:g} s, longer than the duration of {duration:g} s")
-    if duration / dt > MOST_STEPS:
-        raise InputError(f"{duration:g} s in steps of {dt:g} s are more than {MOST_STEPS:g} steps; take a longer dt")
-    steps = int(np.ceil(duration / dt * (1 - 1e-12)))
-    time = float(dt) * np.arange(steps + 1, dtype=np.float64)
-    time[-1] = duration
-    return time
 
 
 def _reference(law: SelectiveLaw, target: Any | Target) -> Reference:

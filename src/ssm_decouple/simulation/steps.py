@@ -13,12 +13,16 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.control.law import GAUSS, SelectiveLaw
+from ssm_decouple.errors import InputError
 from ssm_decouple.momentum.flow import munthe_kaas
 
 Floats = NDArray[np.float64]
 Reference = Callable[[float], tuple[Floats, Floats]]  # time to target position and velocity
 Pace = Callable[[float], float]  # time to the share of the full pace
 Wanted = Callable[[float], Floats | None]  # time to the protected rate that is asked for, None for zero
+
+
+MOST_STEPS = 1e8  # a record of more would not fit into memory
 
 
 class Demand(NamedTuple):
@@ -89,3 +93,22 @@ def runge_kutta(
 
 
 STEPS: dict[str, Step] = {"explicit": explicit, "held": held, "rk4": runge_kutta}
+
+
+def sample_times(duration: float, dt: float) -> Floats:
+    """Return the times of the samples, s; the last step is shorter where `duration` is no multiple of dt.
+
+    Raises:
+        InputError: times that are not positive, or more steps than a record could hold.
+    """
+    for name, value in (("dt", dt), ("duration", duration)):
+        if not (np.isfinite(value) and value > 0):
+            raise InputError(f"{name} is {value}; it must be a positive time, s")
+    if dt > duration:
+        raise InputError(f"dt is {dt:g} s, longer than the duration of {duration:g} s")
+    if duration / dt > MOST_STEPS:
+        raise InputError(f"{duration:g} s in steps of {dt:g} s are more than {MOST_STEPS:g} steps; take a longer dt")
+    steps = int(np.ceil(duration / dt * (1 - 1e-12)))
+    time = float(dt) * np.arange(steps + 1, dtype=np.float64)
+    time[-1] = duration
+    return time

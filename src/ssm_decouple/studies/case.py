@@ -10,16 +10,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pinocchio as pin
 import xarray as xr
 from numpy.typing import NDArray
 
-from ssm_decouple.control.collision import Clearance
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.control.limits import Limits
 from ssm_decouple.control.schedule import Schedule, ScheduledLaw
 from ssm_decouple.control.task import (
     BoresightTask,
@@ -43,6 +41,9 @@ if sys.version_info >= (3, 11):
     import tomllib
 else:
     import tomli as tomllib
+
+if TYPE_CHECKING:
+    from ssm_decouple.control.limits import Limits
 
 Floats = NDArray[np.float64]
 
@@ -308,6 +309,9 @@ def _case(content: dict[str, Any], path: Path) -> Case:
 
 
 def _limits(given: Mapping[str, Any]) -> Limits:
+    from ssm_decouple.control.collision import Clearance
+    from ssm_decouple.control.limits import Limits
+
     clearance = Clearance(given["clearance"]) if "clearance" in given else None
     return Limits(braking=given.get("braking", 0.8), clearance=clearance)
 
