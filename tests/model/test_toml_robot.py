@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-import sys
+import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -13,11 +13,6 @@ from typer.testing import CliRunner
 import ssm_decouple as ssm
 from ssm_decouple.cli import app
 from ssm_decouple.model.catalogue import find_robot, find_urdf
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 WINGED = """urdf = "ets_vii"
 [[appendage]]

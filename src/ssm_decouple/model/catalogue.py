@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
-import sys
+import tomllib
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -15,11 +15,6 @@ from ssm_decouple.errors import InputError, ModelError
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.model.urdf import read_urdf
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 _PACKAGE = Path(__file__).parents[1]
 # Installed, the models lie inside the package; in a source tree they lie at its top.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import json
-import sys
+import tomllib
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -36,11 +36,6 @@ from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.dynamic import Dynamic, Servo
 from ssm_decouple.simulation.simulate import Progress, simulate
 from ssm_decouple.simulation.steps import STEPS
-
-if sys.version_info >= (3, 11):
-    import tomllib
-else:
-    import tomli as tomllib
 
 if TYPE_CHECKING:
     from ssm_decouple.control.limits import Limits
