@@ -59,6 +59,7 @@ def agree(found, i, motion):
     travel = np.sum(speed[:-1] * np.diff(motion.time.values))
     assert found.joint_travel[i] == pytest.approx(travel, abs=1e-12)
     assert found.peak_rate[i] == pytest.approx(np.abs(motion.joint_rates.values).max(), abs=1e-12)
+    assert found.protected_rate[i] == pytest.approx(np.abs(motion.protected_rate.values).max(initial=0), abs=1e-16)
     assert found.base_rotation[i] == pytest.approx(np.ptp(motion.base_rpy.values, axis=0), abs=1e-12)
     assert found.smallest_singular_value[i] == pytest.approx(motion.smallest_singular_value.values.min(), abs=1e-12)
     assert found.configuration[i] == pytest.approx(motion.configuration.values[-1], abs=1e-12)

@@ -183,7 +183,14 @@ class Batch:
         def work(start: int, end: int) -> None:
             part = slice(start, end)
             history = self._move(
-                constants, law.size, joints[part], poses[part], wanted[part], times, record[part], stop
+                constants,
+                (law.size, law.protection.k),
+                joints[part],
+                poses[part],
+                wanted[part],
+                times,
+                record[part],
+                stop,
             )
             errors[part] = history[:, -1]
             _judge(times, history, tolerance, 1.0 / law.gain, outcomes[part], outcome_times[part])
@@ -197,6 +204,7 @@ class Batch:
             final_error=errors,
             joint_travel=record[:, rows.TRAVEL],
             peak_rate=record[:, rows.PEAK],
+            protected_rate=record[:, rows.LEAK],
             base_rotation=record[:, rows.HIGHEST : rows.HIGHEST + 3] - record[:, rows.LOWEST : rows.LOWEST + 3],
             smallest_singular_value=record[:, rows.SMALLEST],
             configuration=self._configurations(joints, poses),
@@ -230,7 +238,7 @@ class Batch:
     def _move(
         self,
         law: LawConstants,
-        size: int,
+        sizes: tuple[int, int],
         joints: Floats,
         poses: Floats,
         targets: Floats,
@@ -238,8 +246,11 @@ class Batch:
         record: Floats,
         stop: Event,
     ) -> Floats:
-        """Move joints and poses to the end of the motion; return the distances to the targets (rows, samples)."""
-        count = len(joints)
+        """Move joints and poses to the end of the motion; return the distances to the targets (rows, samples).
+
+        `sizes` are the law's size and its number of protected directions.
+        """
+        count, (size, k) = len(joints), sizes
         values, out, seen = self._row_values(count), np.empty((count, size)), np.empty((count, 3))
         history = np.empty((times.size, count))
         record[:] = 0.0
@@ -251,7 +262,7 @@ class Batch:
                 break
             rows.see_targets(poses, targets, seen)
             self._command(law, joints, seen, values, out)
-            rows.advance(out, errors + 3, errors, hold, joints, poses, record, history[i])
+            rows.advance(out, k, errors + 3, errors, hold, joints, poses, record, history[i])
         return history.T
 
     def _rows(self, name: str, joints: ArrayLike) -> NDArray[Any]:

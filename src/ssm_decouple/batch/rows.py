@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssm_decouple.control.kernel import compiled, unlocked
+from ssm_decouple.control.kernel import PROTECTED_RATE, compiled, unlocked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -19,10 +19,11 @@ if TYPE_CHECKING:
 # What is kept of a motion, a row each.
 TRAVEL = 0  # integral of the joint rates' norm
 PEAK = 1  # largest joint rate
-SMALLEST = 2  # smallest singular value
-LOWEST = 3  # 3: roll, pitch and yaw at their lowest
-HIGHEST = 6  # 3: at their highest
-RECORD_SIZE = 9
+LEAK = 2  # largest rate along a protected direction
+SMALLEST = 3  # smallest singular value
+LOWEST = 4  # 3: roll, pitch and yaw at their lowest
+HIGHEST = 7  # 3: at their highest
+RECORD_SIZE = 10
 
 
 @compiled
@@ -98,6 +99,7 @@ def see_targets(poses: Floats, targets: Floats, seen: Floats) -> None:
 @unlocked
 def advance(
     commands: Floats,
+    k: int,
     smallest: int,
     errors: int,
     time: float,
@@ -110,6 +112,7 @@ def advance(
 
     Args:
         commands: What the law commands (rows, law.size).
+        k: Number of protected directions.
         smallest: Where the smallest singular value stands in it.
         errors: Where the error of the position (3) stands.
         time: For how long it is held, s; 0 at the last sample.
@@ -130,6 +133,8 @@ def advance(
             square += rate * rate
             kept[PEAK] = max(kept[PEAK], abs(rate))
             joints[row, j] += time * rate
+        for i in range(k):
+            kept[LEAK] = max(kept[LEAK], abs(command[6 + n + PROTECTED_RATE + i]))
         kept[TRAVEL] += time * np.sqrt(square)
         kept[SMALLEST] = min(kept[SMALLEST], command[smallest])
         keep_attitude(poses[row], kept)
