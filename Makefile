@@ -2,8 +2,9 @@
 
 PYTHON ?= python3
 BIN := .venv/bin
+KATEX := 0.16.47
 
-.PHONY: cases test slow lint types snippets tables wheel benchmarks clean
+.PHONY: cases test slow lint types snippets tables docs wheel benchmarks clean
 
 cases: .venv/installed
 	$(BIN)/ssm-decouple compare all --output results
@@ -29,6 +30,11 @@ snippets: .venv/installed-dev
 tables: .venv/installed-dev
 	$(BIN)/python docs/tables.py
 
+# The site, into site/, with warnings as errors. Its generator reads the source and imports none of it, so that it has an
+# environment of its own and needs neither the package nor what that depends on.
+docs: .venv-docs/installed
+	.venv-docs/bin/python docs/build.py
+
 # Build the wheel, install it in an empty environment and run a case from another folder. What builds it stands outside
 # that environment, and not in .venv, so that both can be installed at once.
 wheel:
@@ -49,13 +55,23 @@ benchmarks: .venv/installed-dev
 	$(BIN)/python benchmarks/batch.py
 
 clean:
-	rm -rf .venv .venv-wheel dist results
+	rm -rf .venv .venv-docs .venv-wheel .cache dist docs/assets/katex results site
 
 # pip is renewed first: old resolvers try every version of everything. Most modules are never imported, so none is
 # compiled before it is.
 .venv/bin/python:
 	$(PYTHON) -m venv .venv
 	$(BIN)/pip install --quiet --upgrade pip
+
+.venv-docs/installed: pyproject.toml
+	@command -v npm >/dev/null || { echo "the site needs npm, to fetch KaTeX: apt install npm"; exit 1; }
+	$(PYTHON) -m venv .venv-docs
+	.venv-docs/bin/pip install --quiet --upgrade pip
+	.venv-docs/bin/pip install --quiet --disable-pip-version-check --no-compile --group docs
+	rm -rf docs/assets/katex && mkdir docs/assets/katex
+	cd .venv-docs && npm pack --silent katex@$(KATEX) && tar xzf katex-$(KATEX).tgz
+	cd .venv-docs/package && cp -r LICENSE dist/katex.min.js dist/katex.min.css dist/fonts ../../docs/assets/katex
+	touch $@
 
 .venv/installed: pyproject.toml .venv/bin/python
 	@echo "installing into .venv, a minute or so"

@@ -14,7 +14,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Hashable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import cache
@@ -44,7 +44,7 @@ from ssm_decouple.viewing.table import (
 )
 
 ROOT = Path(__file__).parents[1]
-DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")))
+DOCUMENTS = (ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md")))
 
 
 @cache
@@ -194,6 +194,23 @@ def effects_block() -> str:
     return markdown(effect_table([row for i in (1, 2, 3) for row in effects(ssm.load_case(f"case{i}"))]))
 
 
+def variables(motion: xr.Dataset, without: Collection[Hashable] = ()) -> str:
+    """Return what stands in the record of a motion, but for the variables that are known already."""
+    lines = ["| variable | dimensions | units | frame | what |", "|---|---|---|---|---|"]
+    for name, variable in motion.data_vars.items():
+        if name not in without:
+            frame, meaning = (variable.attrs.get(key, "") for key in ("frame", "long_name"))
+            dimensions = ", ".join(map(str, variable.dims))
+            lines.append(f"| `{name}` | {dimensions} | {variable.attrs['units']} | {frame} | {meaning} |")
+    return "\n".join(lines)
+
+
+def dynamic_record() -> str:
+    """Return what a dynamic motion of a spacecraft with flexible wings holds beside the kinematic record."""
+    case = replace(flexible(ssm.load_case("case1")), duration=1.0, simulation={"method": ssm.Dynamic(step=0.01)})
+    return variables(case.run(), compared("case1").motions["selective"].data_vars)
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
     "cases": lambda: cases_table(""),
     "flight": lambda: cases_table("_flight"),
@@ -206,10 +223,14 @@ BLOCKS: dict[str, Callable[[], str]] = {
     "pointing": pointing_block,
     "dynamic": dynamic,
     "effects": effects_block,
+    "first_case": lambda: markdown_table(compared("case1").summaries()),
+    "record": lambda: variables(compared("case1").motions["selective"]),
+    "dynamic_record": dynamic_record,
 }
 KEPT: dict[str, Callable[[], str]] = {
     "speed": lambda: printed_by("benchmarks/control_step.py"),
     "dynamic_speed": lambda: printed_by("benchmarks/dynamic.py"),
+    "exactness": lambda: printed_by("benchmarks/exactness.py").replace("\n\n", "\n"),  # progress bars left them
     "robustness": robustness,
     "two_arms": lambda: printed_by("examples/two_arms.py", "1000"),
 }

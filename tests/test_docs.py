@@ -1,0 +1,69 @@
+"""The documents and the package agree: every public name has its entry, every picture is made by code."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+from pathlib import Path
+
+import pytest
+
+import ssm_decouple as ssm
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+REFERENCE = "\n".join(page.read_text(encoding="utf-8") for page in sorted((DOCS / "reference").glob("*.md")))
+ENTRIES = re.findall(r"^::: ssm_decouple\.([\w.]+)$", REFERENCE, re.MULTILINE)
+PAGES = sorted(DOCS.rglob("*.md"))
+
+
+def found(path):
+    """Return what an entry of the reference names."""
+    module, name = ssm, path
+    if "." in path:
+        place, name = path.rsplit(".", 1)
+        module = importlib.import_module(f"ssm_decouple.{place}")
+    return getattr(module, name)
+
+
+def names_of(module):
+    """Return the classes and functions of a module that is public as a whole."""
+    return [
+        name
+        for name, value in vars(module).items()
+        if not name.startswith("_")
+        and (inspect.isclass(value) or inspect.isfunction(value))
+        and value.__module__.startswith("ssm_decouple.")
+    ]
+
+
+def test_every_public_name_has_its_entry_in_the_reference():
+    modules = {name for name in ssm.__all__ if inspect.ismodule(getattr(ssm, name))}
+    public = set(ssm.__all__) - modules - {"__version__"}
+    public |= {f"{module}.{name}" for module in modules for name in names_of(getattr(ssm, module))}
+    assert public - set(ENTRIES) == set()
+    assert len(ENTRIES) == len(set(ENTRIES))
+
+
+@pytest.mark.parametrize("path", [entry for entry in ENTRIES if "." in entry])
+def test_every_entry_of_a_module_is_there_and_described(path):
+    if path.startswith("control.pink"):
+        pytest.importorskip("pink")
+    assert inspect.getdoc(found(path))
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(DOCS)))
+def test_every_picture_is_there_and_made_by_code(page):
+    text = page.read_text(encoding="utf-8")
+    saved = set(re.findall(r'savefig\("(\w+)\.png"', text))
+    drawn = set(re.findall(r'"(\w+)": figures\.', (DOCS / "tables.py").read_text(encoding="utf-8")))
+    shown = set(re.findall(r"!\[[^\]]+\]\(images/(\w+)\.png\)", text))
+    assert shown <= saved | drawn
+    assert saved <= shown
+    assert all((DOCS / "images" / f"{name}.png").exists() for name in shown)
+
+
+def test_every_page_is_in_the_navigation():
+    config = (ROOT / "zensical.toml").read_text(encoding="utf-8")
+    assert {str(page.relative_to(DOCS)) for page in PAGES} == set(re.findall(r'= "([\w/]+\.md)" }', config))
