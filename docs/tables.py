@@ -21,6 +21,7 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
+import workspace_tables
 import xarray as xr
 from matplotlib.figure import Figure
 
@@ -211,6 +212,25 @@ def dynamic_record() -> str:
     return variables(case.run(), compared("case1").motions["selective"].data_vars)
 
 
+def workspace_block() -> str:
+    """Return what protections leave of the workspace, and draw the figures."""
+    draw(workspace_tables.figures())
+    return workspace_tables.table()
+
+
+def workspace_targets() -> str:
+    """Return how many of random targets each protection lets the arm reach, and draw the figure."""
+    draw({"workspace_targets": workspace_tables.targets_figure()})
+    return workspace_tables.arrivals()
+
+
+def reactionless() -> str:
+    """Return the block that its benchmark writes, with the figure."""
+    printed_by("benchmarks/reactionless.py")
+    page = (ROOT / "docs" / "reactionless.md").read_text(encoding="utf-8")
+    return page.split("<!-- begin reactionless -->\n\n")[1].split("\n\n<!-- end reactionless -->")[0]
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
     "cases": lambda: cases_table(""),
     "flight": lambda: cases_table("_flight"),
@@ -233,6 +253,13 @@ KEPT: dict[str, Callable[[], str]] = {
     "exactness": lambda: printed_by("benchmarks/exactness.py").replace("\n\n", "\n"),  # progress bars left them
     "robustness": robustness,
     "two_arms": lambda: printed_by("examples/two_arms.py", "1000"),
+    "workspace": workspace_block,
+    "workspace_margins": workspace_tables.margins,
+    "workspace_changes": workspace_tables.changes,
+    "workspace_targets": workspace_targets,
+    "workspace_steps": workspace_tables.steps,
+    "workspace_stops": workspace_tables.stops,
+    "reactionless": reactionless,
 }
 
 

@@ -97,7 +97,14 @@ def test_a_toml_that_makes_no_sense_is_refused(write, text, says):
 def test_the_catalogue_lists_both_kinds(write):
     catalogue = ssm.models()
     assert {path.suffix for path in catalogue.values()} == {".urdf", ".toml"}
-    assert list(catalogue) == ["ets_vii", "ets_vii_bus", "ets_vii_flexible", "ets_vii_flight"]
+    assert list(catalogue) == [
+        "ets_vii",
+        "ets_vii_bus",
+        "ets_vii_flexible",
+        "ets_vii_flight",
+        "seven_joint",
+        "two_arms",
+    ]
     assert find_robot("ets_vii_flexible") == catalogue["ets_vii_flexible"]
     assert find_urdf("ets_vii_flexible").samefile(catalogue["ets_vii"])
     assert find_urdf("ets_vii") == catalogue["ets_vii"]

@@ -31,7 +31,7 @@ from ssm_decouple.cli.shared import (
     print_table,
     progress_bar,
 )
-from ssm_decouple.cli.study import study
+from ssm_decouple.cli.study import Study, study
 from ssm_decouple.errors import DecoupleError, DecoupleWarning
 
 if TYPE_CHECKING:
@@ -65,6 +65,10 @@ Protect = Annotated[str | None, typer.Option("--protect", "-p", help=_PROTECT)]
 Damping = Annotated[
     float | None, typer.Option(help="rho at a singularity, m2, instead of the case's own; 0 for the plain inverse.")
 ]
+NumberOfTargets = Annotated[
+    int | None, typer.Option("--targets", help="Move to so many random targets instead of the case's own.")
+]
+TargetSeed = Annotated[int, typer.Option("--seed", help="Of the random targets.")]
 
 
 def main() -> None:
@@ -130,6 +134,8 @@ def compare(
     dt: TimeStep = None,
     damping: Damping = None,
     dynamic: Dynamics = False,
+    targets: NumberOfTargets = None,
+    seed: TargetSeed = 0,
     no_figures: NoFigures = False,
     no_progress: NoProgress = False,
     as_json: AsJson = False,
@@ -139,10 +145,19 @@ def compare(
     Where the damping acted, the same law undamped is shown too. Writes OUTPUT/comparison.csv and, for each case,
     motions, the figures of its own protection and a sheet that compares the laws.
 
-    Examples: ssm-decouple compare all; ssm-decouple compare case2 my.toml --json
+    With --targets, the laws move from each case's start to so many random targets within the arm's reach instead, and
+    the tables say what share each reaches and what stops the others. Writes OUTPUT/targets.csv and a sheet for each
+    case. A thousand targets take some seconds a law.
+
+    Examples: ssm-decouple compare all; ssm-decouple compare case2 my.toml --json; ssm-decouple compare case1 --targets
+    1000
     """
     from ssm_decouple.studies.comparison import compare_step_by_step, summarise, write_csv
 
+    if targets is not None:
+        loaded = load(cases, damping, dynamic)
+        _compare_at_targets(Study("targets", output, no_figures, as_json), loaded, targets, seed, dt, no_progress)
+        return
     work = _Work(output, no_figures, as_json)
     with work.collecting(), progress_bar(no_progress or as_json) as show:
         for case in load(cases, damping, dynamic):
@@ -158,6 +173,32 @@ def compare(
     if work.rows:
         work.files.append(write_csv(work.rows, work.folder / "comparison.csv"))
     work.report()
+
+
+def _compare_at_targets(
+    work: Study, cases: list[Case], targets: int, seed: int, dt: float | None, no_progress: bool
+) -> None:
+    from ssm_decouple.studies.targets import case_trials
+    from ssm_decouple.viewing import targets as viewing
+
+    pairs, stops, studies = [], [], [case_trials(case, targets, seed, dt) for case in cases]
+    with work.collecting(), progress_bar(no_progress or work.as_json) as show:
+        for trials in studies:
+            try:
+                trials.run(partial(show, trials.targets.start))
+            finally:  # what was done before Ctrl-C counts
+                work.rows += trials.rows()
+                pairs += trials.pairs()
+                stops += trials.stops()
+                if trials.found:
+                    work.draw(f"{trials.targets.start}/targets", viewing.sheet, trials)
+    work.report(
+        {
+            f"{targets} random targets within reach: how each law does": viewing.arrival_table(work.rows),
+            "two laws at the same targets": viewing.pair_table(pairs),
+            "what holds the stalled motions": viewing.stop_table(stops),
+        }
+    )
 
 
 @app.command()

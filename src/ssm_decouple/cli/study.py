@@ -23,6 +23,7 @@ from ssm_decouple.cli.shared import (
     print_table,
     progress_bar,
 )
+from ssm_decouple.cli.workspace import study_workspace
 from ssm_decouple.errors import DecoupleError, InputError
 
 if TYPE_CHECKING:
@@ -30,6 +31,7 @@ if TYPE_CHECKING:
 
 
 study = typer.Typer(no_args_is_help=True, help="Parameter studies of cases.")
+study.command("workspace")(study_workspace)
 
 SmoothStart = Annotated[float, typer.Option("--smooth-start", help="Time over which the motion gathers pace, s.")]
 
@@ -52,7 +54,7 @@ def study_sampling(
     from ssm_decouple.viewing import figures
     from ssm_decouple.viewing.table import drift_table
 
-    work = _Study("sampling", output, no_figures, as_json)
+    work = Study("sampling", output, no_figures, as_json)
     with work.collecting(), progress_bar(no_progress or as_json) as show:
 
         def tick(case: str, nodes: int, dt: float, share: float) -> None:
@@ -89,7 +91,7 @@ def study_bending(
     from ssm_decouple.viewing.table import bending_table
 
     bendable = [flexible(case) for case in load(cases)]
-    work = _Study("bending", output, no_figures, as_json)
+    work = Study("bending", output, no_figures, as_json)
     with work.collecting(), progress_bar(no_progress or as_json) as show:
         for case in bendable:
             motions = {}
@@ -124,7 +126,7 @@ def study_pointing(
     from ssm_decouple.viewing.table import pointing_table
 
     line = _numbers("boresight", boresight)
-    work = _Study("pointing", output, no_figures, as_json)
+    work = Study("pointing", output, no_figures, as_json)
     with work.collecting(), progress_bar(no_progress or as_json) as show:
         for case in load(cases):
             motions = {}
@@ -164,7 +166,7 @@ def study_robustness(
 
     shares = [0.01 * level for level in _numbers("levels", levels)]
     campaigns = [Robustness(case, shares, runs, feedback_gain, seed, workers) for case in load(cases)]
-    work, single = _Study("robustness", output, no_figures, as_json), []
+    work, single = Study("robustness", output, no_figures, as_json), []
     with work.collecting(), progress_bar(no_progress or as_json) as show:
         for campaign in campaigns:
             case = campaign.case
@@ -186,7 +188,7 @@ def study_robustness(
     )
 
 
-class _Study(Products):
+class Study(Products):
     """Rows of a study, with its motions, so that an interruption or an error keeps them."""
 
     def __init__(self, name: str, folder: Path, no_figures: bool, as_json: bool) -> None:
@@ -212,6 +214,7 @@ class _Study(Products):
             self.error = error
 
     def draw(self, name: str, figure: Callable[[Any], Figure], subject: Any) -> None:
+        """Draw a figure, if there is anything to draw."""
         if self.rows:
             self.draw_sheet(name, figure, subject)
 
