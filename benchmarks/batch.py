@@ -1,28 +1,47 @@
-"""The batch engine against plain Python loops: matrices and singular values, and whole motions.
+"""The batch engines against plain Python loops and frax: matrices and singular values, and whole motions.
 
-All candidates take turns in one process, so that the ratios hold whatever the machine does meanwhile.
+All candidates take turns in one process, so that the ratios hold whatever the machine does meanwhile. JAX is kept to
+one core, as its figures are compared with those of one thread.
 
-    python benchmarks/batch.py [largest N, 1000000 by default]
+    python benchmarks/batch.py [largest N, 1000000 by default] [--plot FILE]
 """
 
 from __future__ import annotations
 
+import argparse
 import os
+import resource
 import statistics
-import sys
+import tempfile
 import time
 from collections.abc import Callable
+from typing import Any
 
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # threads for 6 x 6 matrices would only hurt the loops
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+# What frax asks for.
+os.environ.setdefault("JAX_ENABLE_X64", "1")
+os.environ.setdefault(
+    "XLA_FLAGS",
+    "--xla_cpu_multi_thread_eigen=false --xla_cpu_scheduler_type=CPU_SCHEDULER_TYPE_MEMORY_OPTIMIZED",
+)
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pinocchio as pin
 from control_step import plain_numpy
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 import ssm_decouple as ssm
-from ssm_decouple.batch import Batch
+from ssm_decouple.batch import Batch, JaxBatch
+from ssm_decouple.viewing.style import COLUMN, styled
+
+CORES = os.sched_getaffinity(0)
+os.sched_setaffinity(0, {min(CORES)})
+jax.devices("cpu")  # starts the threads of JAX, which inherit this
+os.sched_setaffinity(0, CORES)
 
 Floats = NDArray[np.float64]
 
@@ -77,13 +96,51 @@ def plain_matrices(robot: ssm.Robot) -> Callable[[Floats], tuple[Floats, Floats,
     return compute
 
 
+def with_frax(robot: ssm.Robot, singular_values: bool) -> Callable[[Floats], Any]:
+    """Return J_rc, J_gt and, if wanted, four smallest singular values of many configurations, with frax.
+
+    frax has no centroidal map, but knows free-floating bases: the first six rows of its joint-space inertia matrix are
+    the momentum, whose zero gives J_base.
+    """
+    import frax
+
+    placement = robot.model.frames[robot.end_effector_id].placement
+    with tempfile.NamedTemporaryFile("w", suffix=".urdf") as file:
+        file.write(robot.urdf)
+        file.flush()
+        arm = frax.Manipulator(file.name, floating_base="quaternion", ee_offset=placement.homogeneous)
+    pose = jnp.array([0.0, 0, 0, 1, 0, 0, 0])
+
+    def one(joints: jax.Array) -> Any:
+        frames = arm.joint_to_world_transforms(jnp.concatenate([pose, joints]))
+        M, J = arm._mass_matrix(frames), arm._ee_jacobian(frames)
+        J_base = -jnp.linalg.solve(M[:6, :6], M[:6, 6:])
+        J_rc, J_gt = J_base[3:], J[:3, 6:] + J[:3, :6] @ J_base
+        if not singular_values:
+            return J_rc, J_gt
+        lost = jnp.einsum("ri,ki,kj->krj", J_gt, J_rc, J_rc) / jnp.sum(J_rc * J_rc, axis=1)[:, None, None]
+        left = jnp.concatenate([J_gt[None], J_gt - lost])
+        return J_rc, J_gt, jnp.linalg.svd(left, compute_uv=False)[:, -1]
+
+    run = jax.jit(jax.vmap(one))
+    return lambda joints: [np.asarray(array) for array in run(joints)]
+
+
 def compare_matrices() -> None:
-    """Print how much quicker the engine is than a loop, on one core and on more."""
+    """Print how much quicker the engines are than a loop, on one core and on more."""
     robot = ssm.load_robot("ets_vii")
     joints = np.random.default_rng(0).uniform(-3, 3, (CONFIGURATIONS, robot.n_joints))
     plain, one, all_cores = plain_matrices(robot), Batch(robot, threads=1), Batch(robot)
     found, many = one.matrices(joints[:LOOPED], PROTECTED), np.tile(joints, (8, 1))
     off = max(np.abs(found.smallest_singular_values[i] - plain(row)[2]).max() for i, row in enumerate(joints[:LOOPED]))
+
+    on_jax, frax, frax_matrices = JaxBatch(robot, device="cpu"), with_frax(robot, True), with_frax(robot, False)
+    values = found.smallest_singular_values
+    for name, other in (
+        ("frax", frax(joints[:LOOPED])[2]),
+        ("JAX", on_jax.singular_values(joints[:LOOPED], PROTECTED)),
+    ):
+        print(f"largest difference of a singular value, {name}: {np.abs(other - values).max():.1e} m")
 
     def loop() -> None:
         for row in joints[:LOOPED]:
@@ -93,6 +150,13 @@ def compare_matrices() -> None:
     times = in_turns(
         {
             "plain loop over Pinocchio and NumPy": (LOOPED, loop),
+            "frax (JAX), 1 core, matrices alone": (CONFIGURATIONS, lambda: frax_matrices(joints)),
+            "frax (JAX), 1 core": (CONFIGURATIONS, lambda: frax(joints)),
+            "JaxBatch, 1 core": (CONFIGURATIONS, lambda: on_jax.matrices(joints, PROTECTED)),
+            "JaxBatch, 1 core, singular values alone": (
+                CONFIGURATIONS,
+                lambda: on_jax.singular_values(joints, PROTECTED),
+            ),
             "1 thread, results in memory": (len(many), lambda: one.matrices(many, PROTECTED)),
             "1 thread, in blocks": (len(many), lambda: [None for _ in one.blocks(many, PROTECTED, 8192)]),
             "1 thread, singular values alone": (len(many), lambda: one.singular_values(many, PROTECTED)),
@@ -101,10 +165,11 @@ def compare_matrices() -> None:
     )
     print(f"J_rc, J_gt and the smallest singular values for {', '.join(PROTECTED)}; {robot.name}, 6 joints")
     print(f"largest difference of a singular value: {off:.1e} m")
-    print(f"{'':<40} {'us each':>9} {'thousand/s':>11} {'loop / it':>10}")
-    for name, values in times.items():
-        each = statistics.median(values)
-        print(f"{name:<40} {1e6 * each:9.3f} {1e-3 / each:11.0f} {ratio(times, next(iter(times)), name):10.0f}")
+    print(f"{'':<40} {'us each':>9} {'thousand/s':>11} {'loop / it':>10} {'frax / it':>10}")
+    for name, took in times.items():
+        each = statistics.median(took)
+        ratios = [ratio(times, slow, name) for slow in (next(iter(times)), "frax (JAX), 1 core")]
+        print(f"{name:<40} {1e6 * each:9.3f} {1e-3 / each:11.0f} {ratios[0]:10.0f} {ratios[1]:10.2f}")
     gain = ratio(times, "1 thread, singular values alone", f"{few}, singular values alone")
     print(f"{few} are {gain:.2f} times as quick as one\n")
 
@@ -125,7 +190,7 @@ def compare_motions() -> None:
                 model, moving, STEP * np.hstack([np.asarray(told["base_twist"]), np.asarray(told["joint_rates"])])
             )
 
-    one, all_cores = Batch(case.robot, threads=1), Batch(case.robot)
+    one, all_cores, on_jax = Batch(case.robot, threads=1), Batch(case.robot), JaxBatch(case.robot, device="cpu")
     duration = SAMPLES * STEP
     reached = one.motions(law, q, target, duration, STEP).configuration[0]
     loop()
@@ -135,6 +200,7 @@ def compare_motions() -> None:
             "plain NumPy law in a loop": (SAMPLES, loop),
             "simulate(..), one at a time": (SAMPLES, lambda: ssm.simulate(law, q, target, duration, STEP)),
             "motions, 1 thread": (count, lambda: one.motions(law, q, targets, duration, STEP)),
+            "motions, JaxBatch, 1 core": (count, lambda: on_jax.motions(law, q, targets, duration, STEP)),
             f"motions, {few}": (count, lambda: all_cores.motions(law, q, targets, duration, STEP)),
         }
     )
@@ -164,8 +230,8 @@ def _body(name: str, mass: float) -> str:
     return f'<link name="{name}"><inertial><origin xyz="0 0 0.2"/><mass value="{mass}"/>{inertia}</inertial></link>'
 
 
-def scale(largest: int) -> None:
-    """Print what a configuration costs against the number of joints and of configurations."""
+def scale(largest: int) -> dict[str, dict[int, float]]:
+    """Print what a configuration costs against the number of joints and of configurations; return it, s."""
     engines = {n: Batch(chain(n), threads=1) for n in JOINTS}
     rng = np.random.default_rng(2)
     joints = {n: rng.uniform(-3, 3, (CONFIGURATIONS, n)) for n in JOINTS}
@@ -174,9 +240,7 @@ def scale(largest: int) -> None:
         return lambda: engines[n].singular_values(joints[n], PROTECTED)
 
     times = in_turns({str(n): (CONFIGURATIONS, run(n)) for n in JOINTS})
-    print("joints                us a configuration, 1 thread, four singular values")
-    for name, values in times.items():
-        print(f"{name:<20} {1e6 * statistics.median(values):8.3f}")
+    found = {"joints": {int(name): statistics.median(values) for name, values in times.items()}}
     sizes = [10**e for e in range(2, 9) if 10**e <= largest]
     robot = ssm.load_robot("ets_vii")
     one, many = Batch(robot, threads=1), rng.uniform(-3, 3, (max(sizes), robot.n_joints))
@@ -185,17 +249,70 @@ def scale(largest: int) -> None:
         return lambda: one.singular_values(many[:count], PROTECTED)
 
     times = in_turns({str(count): (count, take(count)) for count in sizes})
-    print("configurations        us a configuration, 1 thread, four singular values, 6 joints")
-    for name, values in times.items():
-        print(f"{name:<20} {1e6 * statistics.median(values):8.3f}")
+    found["configurations"] = {int(name): statistics.median(values) for name, values in times.items()}
+    for what, each in found.items():
+        print(f"{what:<20}  us a configuration, 1 thread, four singular values")
+        for number, value in each.items():
+            print(f"{number:<20} {1e6 * value:8.3f}")
+    return found
 
 
-def main(largest: int) -> None:
-    """Print all tables."""
+def memory(largest: int) -> None:
+    """Print the most memory that the process has held after more and more configurations, taken in blocks."""
+    robot = ssm.load_robot("ets_vii")
+    one = Batch(robot)
+    row = np.linspace(-1, 1, robot.n_joints)
+    print("configurations        peak memory of the process, MiB, results taken in blocks")
+    for count in (10**e for e in range(4, 9) if 10**e <= largest):
+        for _ in one.blocks(np.broadcast_to(row, (count, robot.n_joints)), PROTECTED):
+            pass
+        print(f"{count:<20} {resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024:8.0f}")
+
+
+def on_devices(largest: int) -> None:
+    """Print how many configurations a second the engine on JAX does, on the device that JAX takes."""
+    device = jax.devices()[0]
+    robot = ssm.load_robot("ets_vii")
+    engine, compiled = JaxBatch(robot), Batch(robot)
+    many = np.random.default_rng(3).uniform(-3, 3, (largest, robot.n_joints))
+    print(f"thousand/s            JaxBatch on {device.device_kind}, Batch on {compiled.threads} threads")
+    for count in (10**e for e in range(4, 8) if 10**e <= largest):
+        rates = []
+        for each in (engine, compiled):
+            each.singular_values(many[:count], PROTECTED)
+            start = time.perf_counter()
+            each.singular_values(many[:count], PROTECTED)
+            rates.append(1e-3 * count / (time.perf_counter() - start))
+        print(f"{count:<20} {rates[0]:9.0f} {rates[1]:9.0f}")
+
+
+@styled
+def plot(found: dict[str, dict[int, float]]) -> Figure:
+    """Draw what a configuration costs against the number of joints and of configurations."""
+    figure = Figure(figsize=(COLUMN, 4.2))
+    for axes, (what, each) in zip(figure.subplots(2), found.items(), strict=True):
+        axes.plot(list(each), [1e6 * value for value in each.values()], ".-", color="#0072B2", linewidth=0.8)
+        axes.set(xlabel=what, ylabel="each (us)")
+        axes.set_ylim(bottom=0)
+        if what == "configurations":
+            axes.set_xscale("log")
+    return figure
+
+
+def main(largest: int, file: str | None) -> None:
+    """Print all tables, and draw the last ones if asked to."""
+    memory(largest)  # first: a peak never falls
     compare_matrices()
     compare_motions()
-    scale(largest)
+    on_devices(largest)
+    found = scale(largest)
+    if file is not None:
+        plot(found).savefig(file)
 
 
 if __name__ == "__main__":
-    main(int(float(sys.argv[1])) if len(sys.argv) > 1 else 1_000_000)
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("largest", nargs="?", type=float, default=1e6, help="most configurations, 1000000 by default")
+    parser.add_argument("--plot", metavar="FILE", help="draw the cost, for example to batch.png")
+    given = parser.parse_args()
+    main(int(given.largest), given.plot)

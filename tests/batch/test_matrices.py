@@ -264,3 +264,30 @@ def test_a_joint_that_is_not_supported_is_named():
     model.addJoint(base, pin.JointModelSpherical(), pin.SE3.Identity(), "shoulder")
     with pytest.raises(ssm.InputError, match="joint 'shoulder' has 3 degrees of freedom"):
         Tree.of(model)
+
+
+def test_coupling_factors_are_those_of_the_coupling(robot, rng):
+    protections = some_protections(rng)
+    joints = rng.uniform(-4, 4, (5, robot.n_joints))
+    found = Batch(robot).coupling_factors(joints, protections)
+    for i, row in enumerate(joints):
+        coupling = robot.coupling(robot.configuration(row))
+        for p, protection in enumerate(protections):
+            rows = np.vstack([protection.J_sub(coupling), coupling.J_gt])
+            if np.linalg.cond(rows) > 300.0:  # there rounding is amplified
+                continue
+            wanted = coupling.coupling_factor(protection)
+            assert found[i, p] == pytest.approx(wanted, rel=1e-12, abs=1e-14), (i, protection)
+
+
+def test_coupling_factors_leave_out_what_is_rounding(rng):
+    robot = planar_arm()
+    joints = rng.uniform(-3, 3, (40, 4))
+    found = Batch(robot).coupling_factors(joints, ["none", "all"])
+    for row, factors in zip(joints, found, strict=True):
+        coupling = robot.coupling(robot.configuration(row))
+        wanted = [coupling.coupling_factor(ssm.Protection(name)) for name in ("none", "all")]
+        assert factors == pytest.approx(wanted, rel=1e-10)
+    assert found[:, 1].max() == 0.0
+    joints[3, 1] = np.nan
+    assert np.isnan(Batch(robot).coupling_factors(joints, ["none"])[3]).all()

@@ -39,6 +39,15 @@ def test_steps_protect_to_rounding(ets_vii, rng):
         assert abs(ets_vii.coupling(ets_vii.configuration(row)).J_rc[2] @ rates) < 1e-16
 
 
+@pytest.mark.parametrize("joints", [[150, -20, -10, 0, 0, 0], [0, 90, 90, 0, 0, 0]])  # the second is damped
+def test_steps_know_the_task_s_weight(ets_vii, joints):
+    law = ssm.SelectiveLaw(ets_vii, ssm.Protection("yaw"), rate_limit=np.inf, tasks=[ssm.PositionTask(weight=4.0)])
+    q = ets_vii.configuration(np.deg2rad(joints))
+    command, found = law(q, [-1.8, -0.3, 1.2]), Batch(ets_vii).step(law, q, [-1.8, -0.3, 1.2])
+    assert found.joint_rates[0] == pytest.approx(command.joint_rates, rel=1e-9, abs=1e-15)
+    assert found.smallest_singular_value[0] == pytest.approx(command.smallest_singular_value, rel=1e-9)
+
+
 def test_steps_know_the_law_s_weights_and_wheels(ets_vii, rng):
     wheels = [ssm.Wheel(f"w{i}", np.eye(3)[i], 0.05, 300.0, 1.0) for i in range(3)]
     robot = ets_vii.with_wheels(wheels)

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssm_decouple.control.kernel import compiled, unlocked
+from ssm_decouple.control.kernel import compiled, inlined, unlocked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,6 +68,8 @@ EPS = 2.220446049250313e-16
 NOISE = 16.0 * EPS  # as in control/kernel.py: a row of J_sub below it constrains nothing
 
 TINY = 1e-300
+ROUNDING = 64.0 * EPS  # as in momentum/metrics.py: a semi-axis below this share of the largest is zero
+SWEEPS = 7  # of plane rotations: 3 x 3 matrices need four or five
 
 
 @compiled
@@ -380,56 +382,163 @@ def factor(n: int, k: int, rows: Floats, noise: Floats, lengths: Floats, L: Floa
         unit, diagonal = rows[k + t], L[(t * (t + 3)) // 2]
         square_of(unit, n, scale)
         for lane in range(LANES):
-            length = np.sqrt(scale[lane])
-            diagonal[lane] = length if left[lane] > t else 0.0
+            length = np.sqrt(scale[lane]) if left[lane] > t else 0.0 * scale[lane]
+            diagonal[lane] = length
             scale[lane] = 1.0 / length if length > 0.0 else 0.0
         scale_row(unit, n, scale)
         for i in range(t + 1, 3):
             take_out(unit, rows[k + i], n, L[(i * (i + 1)) // 2 + t])
 
 
+@inlined
+def largest_eigenvalue(xx: float, xy: float, xz: float, yy: float, yz: float, zz: float) -> float:
+    """Return the largest eigenvalue of a symmetric matrix with none below zero.
+
+    It is scaled to trace 1, and the cubic's angle gives it. Of that both cosine and sine are found without
+    cancellation, the sine from the part of B^2 that stands across I and B, B being the matrix less its mean.
+    """
+    trace = xx + yy + zz
+    scale = 1.0 / (trace + TINY)
+    xx, yy, zz = scale * xx - 1.0 / 3.0, scale * yy - 1.0 / 3.0, scale * zz - 1.0 / 3.0
+    xy, xz, yz = scale * xy, scale * xz, scale * yz
+    xxs, yys, zzs = xx * xx + xy * xy + xz * xz, xy * xy + yy * yy + yz * yz, xz * xz + yz * yz + zz * zz
+    square = xxs + yys + zzs
+    half = 0.5 * (xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
+    mean, along = square / 3.0, 6.0 * half / (square + TINY)
+    k0, k1, k2 = xxs - mean - along * xx, yys - mean - along * yy, zzs - mean - along * zz
+    k3 = xx * xy + xy * yy + xz * yz - along * xy
+    k4 = xx * xz + xy * yz + xz * zz - along * xz
+    k5 = xy * xz + yy * yz + yz * zz - along * yz
+    sine = np.sqrt(square * (k0 * k0 + k1 * k1 + k2 * k2 + 2.0 * (k3 * k3 + k4 * k4 + k5 * k5))) / 6.0
+    norm = 1.0 / (np.sqrt(half * half + sine * sine) + TINY)
+    C, S = norm * half, norm * sine
+    # The cube root of C + i S, by Newton's method from between a half and a quarter of the angle.
+    u, v = np.sqrt(0.5 + 0.5 * C), np.sqrt(max(0.5 - 0.5 * C, 0.0))
+    x = (u + 2.0 * np.sqrt(0.5 + 0.5 * u)) / 3.0
+    y = (v + 2.0 * np.sqrt(max(0.5 - 0.5 * u, 0.0))) / 3.0
+    for _ in range(4):
+        p, q = x * x - y * y, -2.0 * x * y
+        weight = 1.0 / (3.0 * (p * p + q * q))
+        x, y = 2.0 / 3.0 * x + weight * (C * p - S * q), 2.0 / 3.0 * y + weight * (C * q + S * p)
+    return trace * (1.0 / 3.0 + 2.0 * np.sqrt(square / 6.0) * x)
+
+
 @compiled
 def smallest_of(L: Floats, totals: Floats, smallest: Floats, volume: Floats) -> None:
     """Fill the smallest singular value of a lower triangle L (6,), and the product of all three.
 
-    The product is that of the diagonal, the two larger ones' is the largest singular value of the cofactors. Its square
-    is the largest eigenvalue of the symmetric G, scaled to trace 1, by the cubic's angle. Of that both cosine and sine
-    are found without cancellation, the sine from the part of B^2 that stands across I and B, B being G less its mean.
+    The product is that of the diagonal, the two larger ones' is the largest singular value of the cofactors.
     """
     for lane in range(LANES):
         a, b, c, d, e, f = L[0, lane], L[1, lane], L[2, lane], L[3, lane], L[4, lane], L[5, lane]
         product = a * c * f
         cf, bf, across = c * f, b * f, b * e - c * d
         af, ae, ac = a * f, a * e, a * c
-        xx, xy, xz = cf * cf + bf * bf + across * across, -(bf * af + across * ae), across * ac
-        yy, yz, zz = af * af + ae * ae, -ae * ac, ac * ac
-        trace = xx + yy + zz
-        scale = 1.0 / (trace + TINY)
-        xx, yy, zz = scale * xx - 1.0 / 3.0, scale * yy - 1.0 / 3.0, scale * zz - 1.0 / 3.0
-        xy, xz, yz = scale * xy, scale * xz, scale * yz
-        xxs, yys, zzs = xx * xx + xy * xy + xz * xz, xy * xy + yy * yy + yz * yz, xz * xz + yz * yz + zz * zz
-        square = xxs + yys + zzs
-        half = 0.5 * (xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
-        mean, along = square / 3.0, 6.0 * half / (square + TINY)
-        k0, k1, k2 = xxs - mean - along * xx, yys - mean - along * yy, zzs - mean - along * zz
-        k3 = xx * xy + xy * yy + xz * yz - along * xy
-        k4 = xx * xz + xy * yz + xz * zz - along * xz
-        k5 = xy * xz + yy * yz + yz * zz - along * yz
-        sine = np.sqrt(square * (k0 * k0 + k1 * k1 + k2 * k2 + 2.0 * (k3 * k3 + k4 * k4 + k5 * k5))) / 6.0
-        norm = 1.0 / (np.sqrt(half * half + sine * sine) + TINY)
-        C, S = norm * half, norm * sine
-        # The cube root of C + i S, by Newton's method from between a half and a quarter of the angle.
-        u, v = np.sqrt(0.5 + 0.5 * C), np.sqrt(max(0.5 - 0.5 * C, 0.0))
-        x = (u + 2.0 * np.sqrt(0.5 + 0.5 * u)) / 3.0
-        y = (v + 2.0 * np.sqrt(max(0.5 - 0.5 * u, 0.0))) / 3.0
-        for _ in range(4):
-            p, q = x * x - y * y, -2.0 * x * y
-            weight = 1.0 / (3.0 * (p * p + q * q))
-            x, y = 2.0 / 3.0 * x + weight * (C * p - S * q), 2.0 / 3.0 * y + weight * (C * q + S * p)
-        largest = np.sqrt(trace * (1.0 / 3.0 + 2.0 * np.sqrt(square / 6.0) * x))
+        largest = np.sqrt(
+            largest_eigenvalue(
+                cf * cf + bf * bf + across * across,
+                -(bf * af + across * ae),
+                across * ac,
+                af * af + ae * ae,
+                -ae * ac,
+                ac * ac,
+            )
+        )
         bad = totals[BAD * LANES + lane]
         smallest[lane] = (product / largest if largest > 0.0 else 0.0) + bad
         volume[lane] = product + bad
+
+
+@compiled
+def turn_columns(B: Floats, V: Floats) -> None:
+    """Turn the columns of B (9,) until they are square to each other, V, the identity at first, with them.
+
+    Column c is numbers 3 c to 3 c + 2. One-sided Jacobi, as in the law's kernel.
+    """
+    for i in range(9):
+        for lane in range(LANES):
+            V[i, lane] = 1.0 if i % 4 == 0 else 0.0
+    for _ in range(SWEEPS):
+        for a, b in ((0, 3), (0, 6), (3, 6)):
+            for lane in range(LANES):
+                aa, bb, ab = 0.0, 0.0, 0.0
+                for r in range(3):
+                    aa += B[a + r, lane] * B[a + r, lane]
+                    bb += B[b + r, lane] * B[b + r, lane]
+                    ab += B[a + r, lane] * B[b + r, lane]
+                needed = ab * ab > EPS * EPS * aa * bb
+                zeta = (bb - aa) / (2.0 * ab if needed else 1.0)
+                t = 1.0 / (abs(zeta) + np.sqrt(1.0 + zeta * zeta))
+                t = (-t if zeta < 0.0 else t) if needed else 0.0
+                cosine = 1.0 / np.sqrt(1.0 + t * t)
+                sine = cosine * t
+                for r in range(3):
+                    x, y = B[a + r, lane], B[b + r, lane]
+                    B[a + r, lane], B[b + r, lane] = cosine * x - sine * y, sine * x + cosine * y
+                    x, y = V[a + r, lane], V[b + r, lane]
+                    V[a + r, lane], V[b + r, lane] = cosine * x - sine * y, sine * x + cosine * y
+
+
+@compiled
+def couple(
+    n: int, k: int, columns: Floats, rows: Floats, L: Floats, totals: Floats, scratch: Floats, factor: Floats
+) -> None:
+    """Fill the largest singular value of J_rc (J_gt N_sub)^+ from what `factor` made of rows (k + 3, n) and L (6,).
+
+    With L V = U S it is that of J_rc units^T V S^-1. Singular values that are rounding are left out. `scratch`
+    (29, LANES) is overwritten.
+    """
+    B, V, turned, other, square = scratch[:9], scratch[9:18], scratch[18:27], scratch[27], scratch[28]
+    for t in range(3):
+        for i in range(k):  # the triangle bears what rounding has left along J_sub, the protected rate does not
+            take_out(rows[i], rows[k + t], n, other)
+    for lane in range(LANES):
+        square[lane] = 0.0
+        for i in range(9):
+            B[i, lane], turned[i, lane] = 0.0, 0.0
+    for j in range(n):
+        own = columns[j]
+        for r in range(3):
+            for lane in range(LANES):
+                rate = own[(ANGULAR + r) * LANES + lane]
+                square[lane] += rate * rate
+                for t in range(3):
+                    turned[3 * r + t, lane] += rate * rows[k + t, j * LANES + lane]
+    for r in range(3):
+        for c in range(r + 1):
+            for lane in range(LANES):
+                B[3 * c + r, lane] = L[(r * (r + 1)) // 2 + c, lane]
+    turn_columns(B, V)
+    for lane in range(LANES):
+        size, largest = 0.0, 0.0
+        for c in range(3):
+            length = B[3 * c, lane] ** 2 + B[3 * c + 1, lane] ** 2 + B[3 * c + 2, lane] ** 2
+            largest = max(largest, length)
+        for i in range(9):
+            size += turned[i, lane] ** 2
+        for c in range(3):
+            length = B[3 * c, lane] ** 2 + B[3 * c + 1, lane] ** 2 + B[3 * c + 2, lane] ** 2
+            scale = 1.0 / np.sqrt(length) if length > ROUNDING * ROUNDING * largest else 0.0
+            for r in range(3):
+                B[3 * c + r, lane] = 0.0
+                for t in range(3):
+                    B[3 * c + r, lane] += scale * turned[3 * r + t, lane] * V[3 * c + t, lane]
+        if size <= ROUNDING * ROUNDING * square[lane]:
+            for i in range(9):
+                B[i, lane] = 0.0
+    for lane in range(LANES):
+        a, b, c, d, e, f = B[0, lane], B[1, lane], B[2, lane], B[3, lane], B[4, lane], B[5, lane]
+        g, h, i = B[6, lane], B[7, lane], B[8, lane]
+        factor[lane] = totals[BAD * LANES + lane] + np.sqrt(
+            largest_eigenvalue(
+                a * a + b * b + c * c,
+                a * d + b * e + c * f,
+                a * g + b * h + c * i,
+                d * d + e * e + f * f,
+                d * g + e * h + f * i,
+                g * g + h * h + i * i,
+            )
+        )
 
 
 @compiled
@@ -465,6 +574,7 @@ def evaluate(
     values: Floats,
     smallest: Floats,
     volumes: Floats,
+    factors: Floats,
 ) -> None:
     """Compute the momentum matrices of many configurations, and what each protection leaves of J_gt.
 
@@ -477,8 +587,9 @@ def evaluate(
         counts: How many they are (protections,).
         firsts: The first of their rows that is not zero, 0 or 3 (protections,).
         values: (rows, 12 n + SINGLES), overwritten; of no rows if not wanted.
-        smallest: Smallest singular value of J_gt N_sub (rows, protections), overwritten.
-        volumes: Product of its singular values (rows, protections), overwritten; of no rows if not wanted.
+        smallest: Smallest singular value of J_gt N_sub (rows, protections), likewise.
+        volumes: Product of its singular values (rows, protections), likewise.
+        factors: Largest singular value of J_rc (J_gt N_sub)^+ (rows, protections), likewise.
     """
     n, mass, holder = joints.shape[1], table[0, CARRIED], int(tool[0])
     q, turns = np.empty((n, LANES)), np.empty((n, 3 * LANES))
@@ -486,6 +597,7 @@ def evaluate(
     columns, totals = np.empty((n, COLUMN_SIZE * LANES)), np.empty(TOTALS_SIZE * LANES)
     rows, small = np.empty((9, n * LANES)), np.empty((12, LANES))
     noise, least, volume, lengths, L = small[0], small[1], small[2], small[3:6], small[6:]
+    scratch, largest = np.empty((29, LANES)), np.empty(LANES)
     for start in range(0, joints.shape[0], LANES):
         there = min(LANES, joints.shape[0] - start)
         for lane in range(LANES):
@@ -508,8 +620,13 @@ def evaluate(
                 noise_of(first, columns, totals, noise)
             lay_rows(directions[p], k, first, columns, rows)
             factor(n, k, rows, noise, lengths, L)
-            smallest_of(L, totals, least, volume)
-            for lane in range(there):
-                smallest[start + lane, p] = least[lane]
-                if volumes.shape[0] > 0:
-                    volumes[start + lane, p] = volume[lane]
+            if smallest.shape[0] > 0:
+                smallest_of(L, totals, least, volume)
+                for lane in range(there):
+                    smallest[start + lane, p] = least[lane]
+                    if volumes.shape[0] > 0:
+                        volumes[start + lane, p] = volume[lane]
+            if factors.shape[0] > 0:
+                couple(n, k, columns, rows, L, totals, scratch, largest)
+                for lane in range(there):
+                    factors[start + lane, p] = largest[lane]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssm_decouple.control.kernel import PROTECTED_RATE, compiled, unlocked
+from ssm_decouple.control.kernel import compiled, unlocked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -99,6 +99,7 @@ def see_targets(poses: Floats, targets: Floats, seen: Floats) -> None:
 @unlocked
 def advance(
     commands: Floats,
+    protected: int,
     k: int,
     smallest: int,
     errors: int,
@@ -112,8 +113,9 @@ def advance(
 
     Args:
         commands: What the law commands (rows, law.size).
-        k: Number of protected directions.
-        smallest: Where the smallest singular value stands in it.
+        protected: Where the rates along the protected directions (k) stand in it.
+        k: Number of these.
+        smallest: Where the smallest singular value stands.
         errors: Where the error of the position (3) stands.
         time: For how long it is held, s; 0 at the last sample.
         joints: Joint positions (rows, n), moved.
@@ -134,7 +136,7 @@ def advance(
             kept[PEAK] = max(kept[PEAK], abs(rate))
             joints[row, j] += time * rate
         for i in range(k):
-            kept[LEAK] = max(kept[LEAK], abs(command[6 + n + PROTECTED_RATE + i]))
+            kept[LEAK] = max(kept[LEAK], abs(command[protected + i]))
         kept[TRAVEL] += time * np.sqrt(square)
         kept[SMALLEST] = min(kept[SMALLEST], command[smallest])
         keep_attitude(poses[row], kept)

@@ -1451,7 +1451,7 @@ def solve_rows(
                 matrices[J_BASE + b, j] = own[b * n + j]
         for r in range(3):
             for j in range(n):
-                matrices[J_TASK + r, j] = own[(6 + r) * n + j]
+                matrices[J_TASK + r, j] = tasks[0, ROOT_WEIGHT] * own[(6 + r) * n + j]
             results[POSITION + r] = own[9 * n + r]
             results[ERRORS + r] = -own[9 * n + r]
         status = solve(
