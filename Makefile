@@ -53,6 +53,7 @@ benchmarks: .venv/installed-dev
 	$(BIN)/python benchmarks/arms.py
 	$(BIN)/python benchmarks/exactness.py
 	$(BIN)/python benchmarks/batch.py
+	$(BIN)/python benchmarks/campaign.py
 
 clean:
 	rm -rf .venv .venv-docs .venv-wheel .cache dist docs/assets/katex results site

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 import ssm_decouple
+from ssm_decouple.cli.campaign import campaign
 from ssm_decouple.cli.shared import (
     INTERRUPTED,
     NOT_ARRIVED,
@@ -52,6 +53,7 @@ app = typer.Typer(
 )
 
 app.add_typer(study, name="study")
+app.add_typer(campaign, name="campaign")
 
 _PROTECT = (
     "Protect this instead of the case's own axes: none, roll, pitch, yaw, all, several as 'roll+yaw', or numbers as "

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import json
 import tomllib
 import xml.etree.ElementTree as ET
@@ -36,6 +35,20 @@ from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.dynamic import Dynamic, Servo
 from ssm_decouple.simulation.simulate import Progress, simulate
 from ssm_decouple.simulation.steps import STEPS
+from ssm_decouple.studies.schema import (
+    AXES,
+    JOINTS,
+    LIST,
+    NAMES,
+    NUMBER,
+    NUMBERS,
+    PHASES,
+    SWITCH,
+    TEXT,
+    TURNS,
+    check_keys,
+    unknown,
+)
 
 if TYPE_CHECKING:
     from ssm_decouple.control.limits import Limits
@@ -45,80 +58,68 @@ Floats = NDArray[np.float64]
 _FOLDER = Path(__file__).parent / "cases"
 
 # What a case file may hold: table, key, what the value must be, and whether it has to be there.
-_NUMBER, _SWITCH, _TEXT, _NUMBERS, _JOINTS, _AXES, _TURNS, _NAMES, _LIST, _PHASES = (
-    "a number",
-    "true or false",
-    "a text",
-    "3 numbers",
-    "a list of numbers or a table by joint name",
-    "a name or a list of directions such as [[0, 0, 1]]",
-    "a table of angles by the name of a visual",
-    "a list of names",
-    "a list of numbers",
-    "a list of tables { from = .., axes = .. }",
-)
 _SCHEMA: dict[str, dict[str, tuple[str, bool]]] = {
-    "": {"title": (_TEXT, False), "robot": (_TEXT, True), "end_effector": (_TEXT, False)},
+    "": {"title": (TEXT, False), "robot": (TEXT, True), "end_effector": (TEXT, False)},
     "start": {
-        "joints_deg": (_JOINTS, False),
-        "joints": (_JOINTS, False),
-        "base_position": (_NUMBERS, False),
-        "base_rpy_deg": (_NUMBERS, False),
-        "linear_momentum": (_NUMBERS, False),
-        "angular_momentum": (_NUMBERS, False),
+        "joints_deg": (JOINTS, False),
+        "joints": (JOINTS, False),
+        "base_position": (NUMBERS, False),
+        "base_rpy_deg": (NUMBERS, False),
+        "linear_momentum": (NUMBERS, False),
+        "angular_momentum": (NUMBERS, False),
     },
-    "target": {"position": (_NUMBERS, False)},
+    "target": {"position": (NUMBERS, False)},
     "protection": {
-        "axes": (_AXES, False),
-        "frame": (_TEXT, False),
-        "phases": (_PHASES, False),
-        "hand_over": (_NUMBER, False),
+        "axes": (AXES, False),
+        "frame": (TEXT, False),
+        "phases": (PHASES, False),
+        "hand_over": (NUMBER, False),
     },
     "law": {
-        "gain": (_NUMBER, False),
-        "rate_limit_deg": (_NUMBER, False),
-        "rate_limit": (_NUMBER, False),
-        "damping": (_NUMBER, False),
-        "damping_threshold": (_NUMBER, False),
-        "hold_nodes": (_NUMBER, False),
-        "acceleration_limit_deg": (_NUMBER, False),
-        "acceleration_limit": (_NUMBER, False),
-        "joint_weights": (_LIST, False),
+        "gain": (NUMBER, False),
+        "rate_limit_deg": (NUMBER, False),
+        "rate_limit": (NUMBER, False),
+        "damping": (NUMBER, False),
+        "damping_threshold": (NUMBER, False),
+        "hold_nodes": (NUMBER, False),
+        "acceleration_limit_deg": (NUMBER, False),
+        "acceleration_limit": (NUMBER, False),
+        "joint_weights": (LIST, False),
     },
-    "limits": {"braking": (_NUMBER, False), "clearance": (_NUMBER, False)},
+    "limits": {"braking": (NUMBER, False), "clearance": (NUMBER, False)},
     "simulation": {
-        "duration": (_NUMBER, True),
-        "dt": (_NUMBER, True),
-        "method": (_TEXT, False),
-        "arrival_tolerance": (_NUMBER, False),
-        "smooth_start": (_NUMBER, False),
+        "duration": (NUMBER, True),
+        "dt": (NUMBER, True),
+        "method": (TEXT, False),
+        "arrival_tolerance": (NUMBER, False),
+        "smooth_start": (NUMBER, False),
     },
     "dynamic": {
-        "step": (_NUMBER, False),
-        "drives": (_TEXT, False),
-        "servo_frequency": (_NUMBER, False),
-        "servo_damping_ratio": (_NUMBER, False),
-        "servo_period": (_NUMBER, False),
-        "servo_protects": (_SWITCH, False),
-        "feedback_gain": (_NUMBER, False),
+        "step": (NUMBER, False),
+        "drives": (TEXT, False),
+        "servo_frequency": (NUMBER, False),
+        "servo_damping_ratio": (NUMBER, False),
+        "servo_period": (NUMBER, False),
+        "servo_protects": (SWITCH, False),
+        "feedback_gain": (NUMBER, False),
     },
-    "spacecraft": {"turned_deg": (_TURNS, False)},
+    "spacecraft": {"turned_deg": (TURNS, False)},
 }
 DRIVES = ("torque", "prescribed")
 
 # What a [[task]] of each kind takes beside kind, gain, weight and level; True where it has to be there.
-_POSE = {"position": (_NUMBERS, True), "rpy_deg": (_NUMBERS, True)}
-_FRAME = {"frame": (_TEXT, False)}
+_POSE = {"position": (NUMBERS, True), "rpy_deg": (NUMBERS, True)}
+_FRAME = {"frame": (TEXT, False)}
 _TASKS: dict[str, tuple[type[Task], dict[str, tuple[str, bool]]]] = {
-    "position": (PositionTask, {**_FRAME, "position": (_NUMBERS, True)}),
-    "orientation": (OrientationTask, {**_FRAME, "rpy_deg": (_NUMBERS, True)}),
+    "position": (PositionTask, {**_FRAME, "position": (NUMBERS, True)}),
+    "orientation": (OrientationTask, {**_FRAME, "rpy_deg": (NUMBERS, True)}),
     "pose": (PoseTask, {**_FRAME, **_POSE}),
-    "relative_pose": (RelativePoseTask, {"frame": (_TEXT, True), "reference": (_TEXT, True), **_POSE}),
-    "boresight": (BoresightTask, {**_FRAME, "direction": (_NUMBERS, True), "toward": (_NUMBERS, True)}),
-    "posture": (PostureTask, {"joints": (_NAMES, False), "positions": (_LIST, False), "positions_deg": (_LIST, False)}),
+    "relative_pose": (RelativePoseTask, {"frame": (TEXT, True), "reference": (TEXT, True), **_POSE}),
+    "boresight": (BoresightTask, {**_FRAME, "direction": (NUMBERS, True), "toward": (NUMBERS, True)}),
+    "posture": (PostureTask, {"joints": (NAMES, False), "positions": (LIST, False), "positions_deg": (LIST, False)}),
     "manipulability": (ManipulabilityTask, {}),
 }
-_ANY_TASK = {"kind": (_TEXT, True), "gain": (_NUMBER, False), "weight": (_NUMBER, False), "level": (_NUMBER, False)}
+_ANY_TASK = {"kind": (TEXT, True), "gain": (NUMBER, False), "weight": (NUMBER, False), "level": (NUMBER, False)}
 
 
 @dataclass(frozen=True)
@@ -169,7 +170,7 @@ class Case:
         known |= {appendage.name for appendage in robot.appendages}
         for name in self.turned:
             if name not in known:
-                raise InputError(f"[spacecraft] turned_deg: {_unknown('part', name, sorted(known - {''}))}")
+                raise InputError(f"[spacecraft] turned_deg: {unknown('part', name, sorted(known - {''}))}")
         turned = []
         for appendage in robot.appendages:
             R = pin.rpy.rpyToMatrix(0.0, self.turned.get(appendage.name, 0.0), 0.0)
@@ -257,12 +258,17 @@ def load_case(source: str | Path) -> Case:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise InputError(f"'{path}' is not TOML: {error}") from error
     try:
-        return _case(content, path)
+        return case_of(content, path)
     except DecoupleError as error:
         raise InputError(f"case '{path}': {error}") from error
 
 
-def _case(content: dict[str, Any], path: Path) -> Case:
+def case_of(content: dict[str, Any], path: Path) -> Case:
+    """Return the case that the content of a TOML file describes; a robot's path is relative to the file's `path`.
+
+    Raises:
+        InputError: as for `load_case`.
+    """
     _validate(content)
     start, law, simulation = (content.get(table, {}) for table in ("start", "law", "simulation"))
     robot = content["robot"]
@@ -346,9 +352,9 @@ def _tasks(content: Mapping[str, Any]) -> tuple[list[Task], Any]:
 def _task(table: Mapping[str, Any], place: str) -> tuple[Task, Any]:
     kind = table.get("kind")
     if kind not in _TASKS:
-        raise InputError(f"{place}{_unknown('kind', str(kind), list(_TASKS))}")
+        raise InputError(f"{place}{unknown('kind', str(kind), list(_TASKS))}")
     made, keys = _TASKS[kind]
-    _check_keys(table, {**_ANY_TASK, **keys}, place)
+    check_keys(table, {**_ANY_TASK, **keys}, place)
     arguments = {key: table[key] for key in ("gain", "weight", "level", "frame", "reference") if key in table}
     if kind == "boresight":
         arguments["direction"] = tuple(table["direction"])
@@ -373,7 +379,7 @@ def _physics(content: Mapping[str, Any]) -> dict[str, Dynamic]:
         return {}
     drives = given.pop("drives", "torque")
     if drives not in DRIVES:
-        raise InputError(f"[dynamic] {_unknown('drives', drives, list(DRIVES))}")
+        raise InputError(f"[dynamic] {unknown('drives', drives, list(DRIVES))}")
     servo = {key.removeprefix("servo_"): given.pop(key) for key in list(given) if key.startswith("servo_")}
     if drives == "prescribed" and servo:
         raise InputError('[dynamic] drives = "prescribed" has no servo: its joints follow the commands at once')
@@ -408,63 +414,14 @@ def _validate(content: dict[str, Any]) -> None:
     tables = [*filter(None, _SCHEMA), "task"]
     for key, value in content.items():
         if key not in _SCHEMA[""] and key not in tables:
-            raise InputError(_unknown("key", key, [*_SCHEMA[""], *tables]))
+            raise InputError(unknown("key", key, [*_SCHEMA[""], *tables]))
         if key in tables and key != "task" and not isinstance(value, dict):
             raise InputError(f"'{key}' must be a table: write [{key}] on a line of its own")
     for table, keys in _SCHEMA.items():
         values = content.get(table, {}) if table else {k: v for k, v in content.items() if k not in tables}
-        _check_keys(values, keys, f"[{table}] " if table else "")
+        check_keys(values, keys, f"[{table}] " if table else "")
     for number, phase in enumerate(content["protection"].get("phases", []), 1):
-        _check_keys(phase, {"from": (_NUMBER, True), "axes": (_AXES, True)}, f"[protection] phase {number} ")
+        check_keys(phase, {"from": (NUMBER, True), "axes": (AXES, True)}, f"[protection] phase {number} ")
     method = content["simulation"].get("method", "explicit")
     if method not in (*STEPS, "dynamic"):
-        raise InputError(f"[simulation] {_unknown('method', method, [*STEPS, 'dynamic'])}")
-
-
-def _check_keys(values: Mapping[str, Any], keys: Mapping[str, tuple[str, bool]], place: str) -> None:
-    for key, value in values.items():
-        if key not in keys:
-            raise InputError(f"{place}{_unknown('key', key, list(keys))}")
-        if not _fits(value, keys[key][0]):
-            raise InputError(f"{place}{key} is {value!r}; it must be {keys[key][0]}")
-    missing = [key for key, (_, needed) in keys.items() if needed and key not in values]
-    if missing:
-        raise InputError(f"{place}{missing[0]} is missing")
-
-
-def _unknown(kind: str, word: str, known: list[str]) -> str:
-    nearest = difflib.get_close_matches(word, known, 1, 0.5)
-    return f"unknown {kind} '{word}'" + (
-        f"; did you mean '{nearest[0]}'?" if nearest else f"; known: {', '.join(known)}"
-    )
-
-
-def _fits(value: Any, kind: str) -> bool:
-    def number(x: Any) -> bool:
-        return isinstance(x, int | float) and not isinstance(x, bool)
-
-    if kind == _NUMBER:
-        return number(value)
-    if kind == _SWITCH:
-        return isinstance(value, bool)
-    if kind == _TEXT:
-        return isinstance(value, str)
-    if kind == _NUMBERS:
-        return isinstance(value, list) and len(value) == 3 and all(map(number, value))
-    if kind == _LIST:
-        return isinstance(value, list) and all(map(number, value))
-    if kind == _NAMES:
-        return isinstance(value, list) and all(isinstance(x, str) for x in value)
-    if kind == _PHASES:
-        return isinstance(value, list) and all(isinstance(x, dict) for x in value)
-    if kind == _TURNS:
-        return isinstance(value, dict) and all(map(number, value.values()))
-    if kind == _AXES:
-        return isinstance(value, str) or (
-            isinstance(value, list) and all(number(x) or (isinstance(x, list) and all(map(number, x))) for x in value)
-        )
-    return (
-        all(map(number, value.values() if isinstance(value, dict) else value))
-        if isinstance(value, dict | list)
-        else False
-    )
+        raise InputError(f"[simulation] {unknown('method', method, [*STEPS, 'dynamic'])}")
