@@ -18,7 +18,7 @@ from ssm_decouple.viewing.table import markdown
 
 SAMPLES = 2**22
 START = np.deg2rad([150.0, -20.0, -10.0, 0.0, 0.0, 0.0])  # case 1
-TARGETS = 10_000
+TARGETS = 2_500
 SOME = ("none", "yaw", "roll+yaw", "all")
 
 
@@ -77,7 +77,7 @@ def changes() -> str:
 
 @cache
 def tried() -> list[Trials]:
-    """Return the finished motions to random targets: half an hour on two processors."""
+    """Return the finished motions to random targets: some minutes on two processors."""
     trials = [workspace_trials(robot, TARGETS) for robot in robots() if "locked" not in robot.name]
     for trial in trials:
         trial.run(lambda law, share, name=trial.targets.robot.name: print(f"\r{name}, {law}: {share:4.0%}   ", end=""))

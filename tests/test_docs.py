@@ -69,3 +69,18 @@ def test_every_picture_is_there_and_made_by_code(page):
 def test_every_page_is_in_the_navigation():
     config = (ROOT / "zensical.toml").read_text(encoding="utf-8")
     assert {str(page.relative_to(DOCS)) for page in PAGES} == set(re.findall(r'= "([\w/]+\.md)" }', config))
+
+
+def test_the_readme_tells_what_the_reactionless_page_found():
+    readme, page = ((ROOT / name).read_text(encoding="utf-8") for name in ("README.md", "docs/reactionless.md"))
+    count = re.search(r"From the cases' starts, ([\d,]+) targets each", page)[1]
+    found = {
+        law: (share, told)
+        for law, share, told in re.findall(r"\| case1 \| (\w+) \| \d \| ([\d.]+) \| ([^|]+) \|", page)
+    }
+    claim = re.search(r"Of ([\d,]+) random targets.*?under reactionless control", readme, re.DOTALL)
+    assert claim[1] == count
+    assert f"{found['none'][0]} % with\nnothing" in claim[0]
+    for law in ("selective", "reactionless"):
+        share, told = found[law]
+        assert re.search(rf"{share} % \((95 % interval )?{told}\)", claim[0]), law
