@@ -4,10 +4,15 @@ PYTHON ?= python3
 BIN := .venv/bin
 KATEX := 0.16.47
 
-.PHONY: cases test slow lint types snippets tables docs wheel benchmarks clean
+.PHONY: cases view test slow lint types snippets tables docs wheel benchmarks clean
 
 cases: .venv/installed
 	$(BIN)/ssm-decouple compare all --output results
+
+# From a clone to a moving picture: case 1 under no, selective and reactionless protection in the browser, until Ctrl-C.
+view: .venv/installed-viewer
+	$(BIN)/ssm-decouple compare case1 --no-figures --output results
+	$(BIN)/ssm-decouple view results/case1/none.nc results/case1/selective.nc results/case1/reactionless.nc
 
 test: .venv/installed-dev
 	$(BIN)/python -m pytest -n auto --dist worksteal
@@ -79,7 +84,12 @@ clean:
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --editable .
 	touch $@
 
+.venv/installed-viewer: pyproject.toml .venv/bin/python
+	@echo "installing into .venv, a minute or so"
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --editable '.[viewer]'
+	touch $@ .venv/installed
+
 .venv/installed-dev: pyproject.toml .venv/bin/python
 	@echo "installing into .venv, two minutes or so"
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-compile --editable '.[dev]'
-	touch $@ .venv/installed
+	touch $@ .venv/installed .venv/installed-viewer

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
 REFERENCE = "\n".join(page.read_text(encoding="utf-8") for page in sorted((DOCS / "reference").glob("*.md")))
 ENTRIES = re.findall(r"^::: ssm_decouple\.([\w.]+)$", REFERENCE, re.MULTILINE)
-SCRIPTS = (DOCS / "tables.py", DOCS / "workspace_tables.py", ROOT / "benchmarks" / "reactionless.py")
+SCRIPTS = (*sorted(DOCS.glob("*.py")), ROOT / "benchmarks" / "reactionless.py")
 DRAWS = "\n".join(script.read_text(encoding="utf-8") for script in SCRIPTS)
 PAGES = sorted(DOCS.rglob("*.md"))
 
@@ -59,7 +59,7 @@ def test_every_entry_of_a_module_is_there_and_described(path):
 def test_every_picture_is_there_and_made_by_code(page):
     text = page.read_text(encoding="utf-8")
     saved = set(re.findall(r'savefig\("(\w+)\.png"', text))
-    drawn = set(re.findall(r'"(\w+)": \w+\.\w+\(', DRAWS))
+    drawn = set(re.findall(r'"(\w+)(?:": \w+\.\w+\(|\.png")', DRAWS))
     shown = set(re.findall(r"!\[[^\]]+\]\(images/(\w+)\.png\)", text))
     assert shown <= saved | drawn
     assert saved <= shown

@@ -69,6 +69,7 @@ if TYPE_CHECKING:
     from ssm_decouple.studies.case import load_case as load_case
     from ssm_decouple.studies.comparison import Comparison as Comparison
     from ssm_decouple.studies.comparison import compare as compare
+    from ssm_decouple.viewing.viewer import view as view
 
 __version__ = "0.1.0"
 
@@ -125,6 +126,7 @@ _HOME = {
     "save_motion": "simulation.motion",
     "selective_rates": "control.arrays",
     "simulate": "simulation.simulate",
+    "view": "viewing.viewer",
 }
 
 # Modules that are public as a whole.

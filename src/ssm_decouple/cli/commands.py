@@ -33,6 +33,7 @@ from ssm_decouple.cli.shared import (
     progress_bar,
 )
 from ssm_decouple.cli.study import Study, study
+from ssm_decouple.cli.view import add_viewer
 from ssm_decouple.errors import DecoupleError, DecoupleWarning
 
 if TYPE_CHECKING:
@@ -54,6 +55,7 @@ app = typer.Typer(
 
 app.add_typer(study, name="study")
 app.add_typer(campaign, name="campaign")
+add_viewer(app)
 
 _PROTECT = (
     "Protect this instead of the case's own axes: none, roll, pitch, yaw, all, several as 'roll+yaw', or numbers as "

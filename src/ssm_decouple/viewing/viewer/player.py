@@ -1,0 +1,281 @@
+"""The page of recorded motions: play, pause, scrub, and what the numbers are meanwhile."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Sequence
+from dataclasses import fields
+from html import escape
+
+import numpy as np
+import viser
+
+from ssm_decouple.viewing.viewer.plots import Curves, Plots, curves_of, law_colors
+from ssm_decouple.viewing.viewer.scene import Scene, usual_exaggeration
+from ssm_decouple.viewing.viewer.server import HOST, PORT, open_server, quiet, url_of
+from ssm_decouple.viewing.viewer.stage import FREE, MOMENTUM, PATH, PROTECTED, SIGHT, TARGET, Shown, Stage
+
+FRAMES = 30  # a second
+TEXTS = 6  # a second: numbers and cursors, which no eye follows faster
+REST = 1.5  # s: at the end, before the motion begins again
+SPEEDS = ("0.5", "1", "2", "5", "10", "20", "50")
+INERTIAL, BASE = "inertial space", "the base"
+_SHOWN = {
+    "axes": "protected directions",
+    "rates": "base rates",
+    "momentum": "momentum",
+    "path": "path",
+    "sight": "line of sight",
+}
+
+
+class Player:
+    """Recorded motions in the browser, side by side, on one clock. It runs until it is stopped.
+
+    Args:
+        scenes: The motions.
+        host: Address to listen on.
+        port: Where the page is; the next free one if it is taken.
+        playing: Whether it plays from the start.
+
+    Attributes:
+        url: Where the page is.
+        server: The viser server.
+        stage: What is drawn.
+        time: What time is shown, s; `seek` changes it.
+        frames: How many frames have been drawn so far.
+    """
+
+    def __init__(self, scenes: Sequence[Scene], host: str = HOST, port: int = PORT, playing: bool = True) -> None:
+        self.scenes = list(scenes)
+        self.server = open_server(host, port)
+        self.url = url_of(self.server, host)
+        self.stage = Stage(self.server, self.scenes)
+        self.end = max(float(scene.time[-1]) for scene in self.scenes)
+        self.time, self.frames = 0.0, 0
+        self.playing, self.riding, self.shown = playing, False, Shown()
+        self.exaggeration = usual_exaggeration(self.scenes)
+        self._rested = 0.0
+        self._changed, self._over = threading.Event(), threading.Event()
+        self._told, self._closed = -1.0, False
+        self._add_controls()
+        self._draw()
+        self._thread = threading.Thread(target=self._run, name="player", daemon=True)
+        self._thread.start()
+
+    def _add_controls(self) -> None:
+        gui = self.server.gui
+        titles = {str(scene.motion.attrs.get("title", scene.motion.attrs["robot"])) for scene in self.scenes}
+        gui.set_panel_label("ssm-decouple")
+        gui.add_html(f'<div style="padding:0.5em 0.9em 0 0.9em"><b>{escape("; ".join(sorted(titles)))}</b></div>')
+        self.play_button = gui.add_button("", icon=viser.Icon.PLAYER_PAUSE)
+        self.slider = gui.add_slider("time (s)", 0.0, self.end, self.end / 1500, 0.0)
+        self.speed = gui.add_dropdown("speed", tuple(f"{word} x" for word in SPEEDS), initial_value="10 x")
+        self.repeat = gui.add_checkbox("repeat", True)
+        self.view = gui.add_dropdown("seen from", (INERTIAL, BASE), initial_value=INERTIAL)
+        self.bending: viser.GuiSliderHandle[float] | None = None
+        if any(scene.wings for scene in self.scenes):
+            # A slider of powers of ten: bendings differ that much.
+            start = float(np.log10(self.exaggeration))
+            self.bending = gui.add_slider("", 0.0, float(max(3.0, np.ceil(start))), 0.01, start)
+            self.bending.on_update(lambda _: self._on_bending())
+            self._on_bending()
+        self.table = gui.add_html(self._table())
+        gui.add_html(_LEGEND)
+        self.chosen = None
+        if len(self.scenes) > 1:
+            names = tuple(_distinct([scene.name for scene in self.scenes]))
+            own = next((i for i, scene in enumerate(self.scenes) if scene.name == "selective"), 0)
+            self.chosen = gui.add_dropdown("plots of", names, initial_value=names[own])
+            self.chosen.on_update(lambda _: self._replot())
+        self.plots = Plots(self.server, self._curves())
+        with gui.add_folder("shown", expand_by_default=False):
+            self.checks = {field.name: gui.add_checkbox(_SHOWN[field.name], True) for field in fields(Shown)}
+        for check in self.checks.values():
+            check.on_update(lambda _: self._on_shown())
+        self.play_button.on_click(lambda _: self.pause() if self.playing else self.play())
+        self.slider.on_update(self._on_slider)
+        self.view.on_update(lambda _: self._set_riding())
+        self._label_button()
+
+    def _on_slider(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
+        if event.client is not None:  # a person's hand, and not this player's own cursor
+            self.pause()
+            self.seek(self.slider.value)
+
+    def _on_bending(self) -> None:
+        assert self.bending is not None
+        self.exaggeration = float(f"{10.0**self.bending.value:.2g}")
+        self.bending.label = f"bending x {self.exaggeration:g}"
+        self._changed.set()
+
+    def _on_shown(self) -> None:
+        self.shown = Shown(**{name: check.value for name, check in self.checks.items()})
+        self._changed.set()
+
+    def _set_riding(self) -> None:
+        self.riding = self.view.value == BASE
+        self._changed.set()
+
+    def _curves(self) -> list[Curves]:
+        chosen = 0 if self.chosen is None else self.chosen.options.index(self.chosen.value)
+        return curves_of(self.scenes, chosen)
+
+    def _replot(self) -> None:
+        self.plots.show(self._curves(), self.time)
+
+    def _label_button(self) -> None:
+        self.play_button.label = "pause" if self.playing else "play"
+        self.play_button.icon = viser.Icon.PLAYER_PAUSE if self.playing else viser.Icon.PLAYER_PLAY
+
+    def play(self) -> None:
+        """Play on from the time shown, from the start where that is the end."""
+        if self.time >= self.end:
+            self.time = 0.0
+        self.playing = True
+        self._label_button()
+        self._changed.set()
+
+    def pause(self) -> None:
+        """Stand still."""
+        self.playing = False
+        self._label_button()
+
+    def seek(self, time: float) -> None:
+        """Show a time, s."""
+        self.time = float(np.clip(time, 0.0, self.end))
+        self._changed.set()
+
+    def wait(self) -> None:
+        """Wait until it is stopped, or Ctrl-C."""
+        try:
+            while not self._over.wait(0.5):
+                pass
+        except KeyboardInterrupt:
+            self.stop()
+
+    def stop(self) -> None:
+        """Close the page."""
+        if self._closed:
+            return
+        self._closed = True
+        self._over.set()
+        self._changed.set()
+        if self._thread is not threading.current_thread():
+            self._thread.join(timeout=5.0)
+        with quiet():
+            self.server.stop()
+
+    def __enter__(self) -> Player:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+    def _run(self) -> None:
+        last = due = time.monotonic()
+        while not self._over.is_set():
+            changed = self._changed.wait(max(0.0, due - time.monotonic()))
+            self._changed.clear()
+            now = time.monotonic()
+            due = max(due, now - 1.0 / FRAMES) + 1.0 / FRAMES
+            moved = self._advance(now - last)
+            last = now
+            if moved or changed:
+                self._draw()
+
+    def _advance(self, elapsed: float) -> bool:
+        """Move the clock on, and say whether it moved; it stands while nobody looks."""
+        if not self.playing or not self.server.get_clients():
+            return False
+        if self.time < self.end:
+            self.time = min(self.end, self.time + elapsed * float(self.speed.value.split()[0]))
+            self._rested = 0.0
+            return True
+        self._rested += elapsed
+        if self._rested < REST:
+            return False
+        if self.repeat.value:
+            self.time = 0.0
+            return True
+        self.pause()
+        return False
+
+    def _draw(self) -> None:
+        self.stage.draw(self.time, self.riding, self.exaggeration, self.shown)
+        self.frames += 1
+        now = time.monotonic()
+        if now - self._told > 1.0 / TEXTS or not self.playing:
+            self._told = now
+            with self.server.atomic():
+                self.slider.value = self.time  # type: ignore[misc]  # viser's setter stands in a class between
+                self.table.content = self._table()
+                self.plots.move(self.time)
+
+    def _table(self) -> str:
+        """Return the numbers of the time shown, a row a motion."""
+        rows = [
+            _row(scene, color, self.time)
+            for scene, color in zip(self.scenes, law_colors([scene.name for scene in self.scenes]), strict=True)
+        ]
+        heads = "".join(
+            f'<th style="text-align:right">{head}</th>' for head in ("left", "turned", "|w_sub|", "momentum")
+        )
+        units = "".join(f'<td style="text-align:right">{unit}</td>' for unit in ("mm", "deg", "rad/s", "N m s"))
+        return (
+            '<div style="padding:0.2em 0.9em"><table style="font-size:0.8em;width:100%;border-spacing:0.2em 0">'
+            f'<tr><th style="text-align:left">t = {self.time:.1f} s</th>{heads}</tr>'
+            f'<tr style="opacity:0.6"><td></td>{units}</tr>{"".join(rows)}</table></div>'
+        )
+
+
+def numbers(scene: Scene, now: float) -> tuple[str, str, str, str]:
+    """Return distance to the target (mm), rotation of the base (deg), protected rate and momentum in words."""
+    i = int(np.clip(np.searchsorted(scene.time, now, side="right") - 1, 0, len(scene.time) - 1))
+    left = 1e3 * scene.distance[i]
+    protected = "-" if scene.protected_rate is None else f"{scene.protected_rate[i]:.0e}"
+    momentum = f"{np.linalg.norm(scene.angular_momentum[i]):.3g}" if scene.has_momentum else "zero"
+    return f"{left:.1f}" if np.isfinite(left) else "-", f"{scene.turned_deg[i]:.3f}", protected, momentum
+
+
+def status(scene: Scene, now: float) -> str:
+    """Return how the motion stands at a time: under way, arrived or stalled."""
+    outcome, when = scene.motion.attrs.get("outcome", "running"), float(scene.motion.attrs.get("outcome_time", np.inf))
+    if outcome == "running" or now < when:
+        return "under way"
+    return {"converged": "arrived", "stalled": "stalled"}[outcome]
+
+
+def _row(scene: Scene, color: str, now: float) -> str:
+    cells = "".join(f'<td style="text-align:right">{value}</td>' for value in numbers(scene, now))
+    state = status(scene, now)
+    shade = {"arrived": "#2CA02C", "stalled": "#E8590C"}.get(state, "inherit")
+    return (
+        f'<tr><td><span style="color:{color}">&#9632;</span> {escape(scene.name)}'
+        f'<br><span style="color:{shade};font-size:0.9em">{state}</span></td>{cells}</tr>'
+    )
+
+
+def _distinct(names: Sequence[str]) -> list[str]:
+    return [name if names.count(name) == 1 else f"{name} ({i + 1})" for i, name in enumerate(names)]
+
+
+def _square(color: tuple[int, int, int], text: str) -> str:
+    return f'<span style="color:rgb{color}">&#9632;</span>&nbsp;{text}'
+
+
+_LEGEND = (
+    '<div style="font-size:0.78em;padding:0.2em 0.9em;line-height:1.5">'
+    + " &ensp;".join(
+        [
+            _square(PROTECTED, "U_c, protected rate"),
+            _square(FREE, "free rate"),
+            _square(MOMENTUM, "momentum"),
+            _square(PATH, "path"),
+            _square(TARGET, "target"),
+            _square(SIGHT, "line of sight"),
+        ]
+    )
+    + "</div>"
+)
