@@ -4,7 +4,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 KATEX := 0.16.47
 
-.PHONY: cases view test slow lint types snippets tables docs wheel benchmarks clean
+.PHONY: cases view test slow lint types snippets tables tables-check docs wheel benchmarks clean
 
 cases: .venv/installed
 	$(BIN)/ssm-decouple compare all --output results
@@ -27,9 +27,12 @@ lint: .venv/installed-dev
 types: .venv/installed-dev
 	$(BIN)/mypy
 
-# Every Python block in the documents runs; the tables in them are what the commands print today.
+# Every Python block in the documents runs.
 snippets: .venv/installed-dev
 	$(BIN)/python -m pytest -p no:cacheprovider README.md docs
+
+# The tables in the documents are what the commands print today.
+tables-check: .venv/installed-dev
 	$(BIN)/python docs/tables.py --check
 
 tables: .venv/installed-dev

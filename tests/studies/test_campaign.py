@@ -5,6 +5,7 @@ import multiprocessing
 import operator
 import os
 import shutil
+import signal
 import subprocess
 import sys
 import textwrap
@@ -416,6 +417,24 @@ def test_a_full_disk_stops_it_and_room_lets_it_go_on(load, tmp_path):
 
 
 # Who computes it
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+def test_an_interrupt_that_python_drops_is_heeded(load, tmp_path):
+    """One that comes while an object is cleared up goes no further than a notice."""
+
+    class Clearing:
+        def __del__(self):
+            signal.raise_signal(signal.SIGINT)
+
+    def tell(done, size):
+        if done == 5:
+            Clearing()
+
+    with pytest.raises(KeyboardInterrupt):
+        load().run(tmp_path / "s", progress=tell)
+    assert 5 <= Store.open(tmp_path / "s").status().done <= 10
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
 def test_processes_give_the_same_store_also_when_they_die(load, tmp_path):

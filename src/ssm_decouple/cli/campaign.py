@@ -258,7 +258,8 @@ def _progress(hidden: bool) -> Iterator[Callable[[int, int], None]]:
         def show(done: int, size: int) -> None:
             nonlocal told
             now = time.monotonic()
-            begun.append((now, done)) if not begun else None
+            if not begun:
+                begun.append((now, done))
             pace = _pace(now - begun[0][0], done - begun[0][1], size - done)
             bars.update(task, completed=done, total=size, pace=pace)
             if not (hidden or console.is_terminal) and (now - told > LOG_EVERY or done == size):

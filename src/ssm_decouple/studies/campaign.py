@@ -345,16 +345,17 @@ class Campaign:
             KeyboardInterrupt: Ctrl-C; chunks that were finished stay.
         """
         from ssm_decouple.studies.store import Store
-        from ssm_decouple.studies.workers import pool_of
+        from ssm_decouple.studies.workers import heeded_interrupts, pool_of
 
         with Store.writing(store, self, resume) as kept:
             pool = pool_of(self, workers, scheduler, note or (lambda _: None))
             there = kept.samples_done
             if progress is not None:
                 progress(there, self.size)
-            with closing(pool.results(kept.missing())) as results:
+            with closing(pool.results(kept.missing())) as results, heeded_interrupts() as heed:
                 for chunk, rows in results:
                     kept.write(chunk, rows)
+                    heed()
                     there += len(rows["draw"])
                     if progress is not None:
                         progress(there, self.size)

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from importlib import import_module
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
+from types import FrameType
 from typing import Any, Protocol
 
 from ssm_decouple.errors import DecoupleError, FileError, InputError
@@ -66,6 +67,33 @@ def pool_of(campaign: Campaign, workers: int, scheduler: str | None, note: Note)
     if workers < 1:
         raise InputError(f"workers is {workers}; give at least 1")
     return Here(campaign) if workers == 1 else Processes(campaign, workers, note)
+
+
+@contextmanager
+def heeded_interrupts() -> Iterator[Callable[[], None]]:
+    """Give a function that raises KeyboardInterrupt if one was asked for and got lost.
+
+    Python drops one that comes while it clears up an object. Where somebody else handles Ctrl-C, that stays so.
+    """
+    asked = threading.Event()
+
+    def remember(number: int, frame: FrameType | None) -> None:
+        asked.set()
+        signal.default_int_handler(number, frame)
+
+    def heed() -> None:
+        if asked.is_set():
+            raise KeyboardInterrupt
+
+    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+    if not (usual and threading.current_thread() is threading.main_thread()):
+        yield heed
+        return
+    signal.signal(signal.SIGINT, remember)
+    try:
+        yield heed
+    finally:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 class Here:
