@@ -260,6 +260,7 @@ KEPT: dict[str, Callable[[], str]] = {
     "workspace_steps": workspace_tables.steps,
     "workspace_stops": workspace_tables.stops,
     "reactionless": reactionless,
+    "batch_speed": lambda: printed_by("benchmarks/batch.py", "1e7"),
     "viewer_speed": lambda: printed_by("benchmarks/viewer.py"),
     "campaign": lambda: printed_by("benchmarks/campaign.py"),
 }
