@@ -433,8 +433,23 @@ def test_an_interrupt_that_python_drops_is_heeded(load, tmp_path):
 
     with pytest.raises(KeyboardInterrupt):
         load().run(tmp_path / "s", progress=tell)
-    assert 5 <= Store.open(tmp_path / "s").status().done <= 10
+    assert Store.open(tmp_path / "s").status().done == 10
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_interrupt_waits_for_the_end_of_a_write(load, tmp_path, monkeypatch):
+    write, seen = Store.write, []
+
+    def interrupted(self, chunk, rows):
+        signal.raise_signal(signal.SIGINT)
+        seen.append(chunk)
+        write(self, chunk, rows)
+
+    monkeypatch.setattr(Store, "write", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        load().run(tmp_path / "s")
+    assert seen == [0]
+    assert Store.open(tmp_path / "s").status().done == 5
 
 
 def test_processes_give_the_same_store_also_when_they_die(load, tmp_path):

@@ -7,7 +7,7 @@ import json
 import tomllib
 import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import asdict, dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -345,20 +345,23 @@ class Campaign:
             KeyboardInterrupt: Ctrl-C; chunks that were finished stay.
         """
         from ssm_decouple.studies.store import Store
-        from ssm_decouple.studies.workers import heeded_interrupts, pool_of
+        from ssm_decouple.studies.workers import Interrupts, pool_of
 
-        with Store.writing(store, self, resume) as kept:
+        with ExitStack() as open_things:
+            interrupts = open_things.enter_context(Interrupts())
+            with interrupts.held():
+                kept = open_things.enter_context(Store.writing(store, self, resume))
+                todo, there = kept.missing(), kept.samples_done
             pool = pool_of(self, workers, scheduler, note or (lambda _: None))
-            there = kept.samples_done
             if progress is not None:
                 progress(there, self.size)
-            with closing(pool.results(kept.missing())) as results, heeded_interrupts() as heed:
-                for chunk, rows in results:
+            results = open_things.enter_context(closing(pool.results(todo)))
+            for chunk, rows in results:
+                with interrupts.held():
                     kept.write(chunk, rows)
-                    heed()
-                    there += len(rows["draw"])
-                    if progress is not None:
-                        progress(there, self.size)
+                there += len(rows["draw"])
+                if progress is not None:
+                    progress(there, self.size)
             if pool.lost:
                 raise FileError(_lost(self, pool.lost, kept.path))
         return Store.open(store).dataset()

@@ -69,31 +69,42 @@ def pool_of(campaign: Campaign, workers: int, scheduler: str | None, note: Note)
     return Here(campaign) if workers == 1 else Processes(campaign, workers, note)
 
 
-@contextmanager
-def heeded_interrupts() -> Iterator[Callable[[], None]]:
-    """Give a function that raises KeyboardInterrupt if one was asked for and got lost.
+class Interrupts:
+    """Ctrl-C, heeded where nothing is half done: not in the middle of a write, and not lost.
 
-    Python drops one that comes while it clears up an object. Where somebody else handles Ctrl-C, that stays so.
+    Zarr writes through an event loop that an interrupt would leave running, and Python drops an interrupt that comes
+    while it clears up an object. Where somebody else handles Ctrl-C, that stays so.
     """
-    asked = threading.Event()
 
-    def remember(number: int, frame: FrameType | None) -> None:
-        asked.set()
-        signal.default_int_handler(number, frame)
+    def __init__(self) -> None:
+        self._asked, self._held = threading.Event(), False
 
-    def heed() -> None:
-        if asked.is_set():
+    def __enter__(self) -> Interrupts:
+        usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        self._ours = usual and threading.current_thread() is threading.main_thread()
+        if self._ours:
+            signal.signal(signal.SIGINT, self._remember)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._ours:
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Hold an interrupt back until the end of the block; raise there whatever came so far."""
+        self._held = True
+        try:
+            yield
+        finally:
+            self._held = False
+        if self._asked.is_set():
             raise KeyboardInterrupt
 
-    usual = signal.getsignal(signal.SIGINT) is signal.default_int_handler
-    if not (usual and threading.current_thread() is threading.main_thread()):
-        yield heed
-        return
-    signal.signal(signal.SIGINT, remember)
-    try:
-        yield heed
-    finally:
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+    def _remember(self, number: int, frame: FrameType | None) -> None:
+        self._asked.set()
+        if not self._held:
+            signal.default_int_handler(number, frame)
 
 
 class Here:
