@@ -63,18 +63,15 @@ def view(
 
 @contextmanager
 def _opened(motions: list[Path], live: str | None, host: str, port: int, meshes: list[Path]) -> Iterator[Player | Live]:
-    if live is not None:
-        from ssm_decouple.viewing.viewer.server import require_viser
+    from ssm_decouple.viewing.viewer.server import require_viser
 
-        require_viser()
+    require_viser()
+    if live is not None:
         from ssm_decouple.viewing.viewer.live import live as open_live
 
         with open_live(live, host, port, tuple(meshes)) as page:
             yield page
         return
-    from ssm_decouple.viewing.viewer.server import require_viser
-
-    require_viser()
     from ssm_decouple.viewing.viewer.player import Player
 
     with Player(_scenes(motions, meshes), host, port) as player:

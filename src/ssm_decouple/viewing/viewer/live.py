@@ -25,15 +25,15 @@ from ssm_decouple.model.catalogue import models
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.motion import judge
 from ssm_decouple.studies.case import Case, cases, load_case
+from ssm_decouple.viewing.viewer.page import Page
 from ssm_decouple.viewing.viewer.parts import Part, spacecraft_parts
 from ssm_decouple.viewing.viewer.plots import AXES, FLOOR, HEIGHT, POINTS, caption
 from ssm_decouple.viewing.viewer.scene import body_poses
-from ssm_decouple.viewing.viewer.server import HOST, PORT, open_server, quiet, url_of
-from ssm_decouple.viewing.viewer.stage import FAINT, PATH, PROTECTED, add_part, antenna, sight_line
+from ssm_decouple.viewing.viewer.server import HOST, PORT
+from ssm_decouple.viewing.viewer.stage import FAINT, PATH, PROTECTED, SIGHT, TARGET, add_part, antenna, sight_line
 
 Floats = NDArray[np.float64]
 
-FRAMES = 30  # a second
 TEXTS = 4  # a second
 PACES = ("1", "2", "5", "10", "20")
 KEPT = 4000  # samples of the past, for the plots and to judge what has stalled
@@ -54,7 +54,7 @@ class _Past:
     changed: float = 0.0
 
 
-class Live:
+class Live(Page):
     """A case or a robot whose target is dragged in the browser. It runs until it is stopped.
 
     The law is asked each `dt` of its own, and at once when the target or the protection changes; in between its joint
@@ -98,16 +98,13 @@ class Live:
         self.frames = 0
         self._data = self.robot.model.createData()
         self._asked: float | None = None
-        self._lock, self._wake, self._over = threading.RLock(), threading.Event(), threading.Event()
-        self._told, self._closed = 0.0, False
-        self.server = open_server(host, port)
-        self.url = url_of(self.server, host)
+        self._lock, self._told = threading.RLock(), 0.0
+        super().__init__(host, port)
         self._add_spacecraft(spacecraft_parts(self.robot, case.turned, mesh_folders))
         self._add_controls()
         self._ask()
         self._draw()
-        self._thread = threading.Thread(target=self._run, name="live", daemon=True)
-        self._thread.start()
+        self._begin()
 
     @property
     def law(self) -> SelectiveLaw:
@@ -165,7 +162,7 @@ class Live:
         found = antenna(parts)
         if found is not None:
             foot, line = found[0], sight_line(found[1], self.size)
-            scene.add_line_segments("/spacecraft/body_0/line_of_sight", line, np.array((0, 158, 115)), position=foot)
+            scene.add_line_segments("/spacecraft/body_0/line_of_sight", line, np.array(SIGHT), position=foot)
         self.U_c = scene.add_frame("/spacecraft/U_c", show_axes=False)
         reach, place = self.robot.reach, self.robot.shoulder_position(q)
         start = self.target.translation if self.posed else self.target
@@ -179,7 +176,7 @@ class Live:
             wxyz=pin.Quaternion(self.target.rotation).coeffs()[[3, 0, 1, 2]] if self.posed else (1.0, 0.0, 0.0, 0.0),
         )
         self.handle.on_update(lambda _: self.drag(self.handle.position, self.handle.wxyz))
-        scene.add_icosphere("/target/ball", radius=0.035 * reach, color=(230, 159, 0))
+        scene.add_icosphere("/target/ball", radius=0.035 * reach, color=TARGET)
         self.trail = scene.add_line_segments("/trail", np.zeros((1, 2, 3)), np.array(PATH), thickness=0.008 * reach)
         self.gap = scene.add_line_segments("/gap", np.zeros((1, 2, 3)), np.array(FAINT), thickness=0.004 * reach)
         middle = 0.5 * (place + start)
@@ -230,14 +227,8 @@ class Live:
             )
         self._drawn_for = self.chosen
 
-    def _run(self) -> None:
-        last = due = time.monotonic()
-        while not self._over.is_set():
-            self._wake.wait(max(0.0, due - time.monotonic()))
-            now = time.monotonic()
-            due = max(due, now - 1.0 / FRAMES) + 1.0 / FRAMES
-            self.advance(min(now - last, 0.25))
-            last = now
+    def _tick(self, elapsed: float, woken: bool) -> None:
+        self.advance(min(elapsed, 0.25))
 
     def advance(self, elapsed: float) -> None:
         """Let the motion go on by some time of the clock on the wall, s, and draw it."""
@@ -390,32 +381,6 @@ class Live:
         grid = np.linspace(max(times[0], times[-1] - FOLLOWED), times[-1], POINTS)
         powers = np.log10(np.maximum(rates, FLOOR))
         return grid - times[-1], 1e3 * np.interp(grid, times, errors), np.interp(grid, times, powers)
-
-    def wait(self) -> None:
-        """Wait until it is stopped, or Ctrl-C."""
-        try:
-            while not self._over.wait(0.5):
-                pass
-        except KeyboardInterrupt:
-            self.stop()
-
-    def stop(self) -> None:
-        """Close the page."""
-        if self._closed:
-            return
-        self._closed = True
-        self._over.set()
-        self._wake.set()
-        if self._thread is not threading.current_thread():
-            self._thread.join(timeout=5.0)
-        with quiet():
-            self.server.stop()
-
-    def __enter__(self) -> Live:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
 
 def laws_to_choose(case: Case) -> dict[str, SelectiveLaw]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Sequence
 from dataclasses import fields
@@ -11,12 +10,12 @@ from html import escape
 import numpy as np
 import viser
 
+from ssm_decouple.viewing.viewer.page import Page
 from ssm_decouple.viewing.viewer.plots import Curves, Plots, curves_of, law_colors
 from ssm_decouple.viewing.viewer.scene import Scene, usual_exaggeration
-from ssm_decouple.viewing.viewer.server import HOST, PORT, open_server, quiet, url_of
+from ssm_decouple.viewing.viewer.server import HOST, PORT
 from ssm_decouple.viewing.viewer.stage import FREE, MOMENTUM, PATH, PROTECTED, SIGHT, TARGET, Shown, Stage
 
-FRAMES = 30  # a second
 TEXTS = 6  # a second: numbers and cursors, which no eye follows faster
 REST = 1.5  # s: at the end, before the motion begins again
 SPEEDS = ("0.5", "1", "2", "5", "10", "20", "50")
@@ -30,7 +29,7 @@ _SHOWN = {
 }
 
 
-class Player:
+class Player(Page):
     """Recorded motions in the browser, side by side, on one clock. It runs until it is stopped.
 
     Args:
@@ -48,21 +47,18 @@ class Player:
     """
 
     def __init__(self, scenes: Sequence[Scene], host: str = HOST, port: int = PORT, playing: bool = True) -> None:
+        super().__init__(host, port)
         self.scenes = list(scenes)
-        self.server = open_server(host, port)
-        self.url = url_of(self.server, host)
         self.stage = Stage(self.server, self.scenes)
         self.end = max(float(scene.time[-1]) for scene in self.scenes)
         self.time, self.frames = 0.0, 0
         self.playing, self.riding, self.shown = playing, False, Shown()
         self.exaggeration = usual_exaggeration(self.scenes)
         self._rested = 0.0
-        self._changed, self._over = threading.Event(), threading.Event()
-        self._told, self._closed = -1.0, False
+        self._told = -1.0
         self._add_controls()
         self._draw()
-        self._thread = threading.Thread(target=self._run, name="player", daemon=True)
-        self._thread.start()
+        self._begin()
 
     def _add_controls(self) -> None:
         gui = self.server.gui
@@ -108,15 +104,15 @@ class Player:
         assert self.bending is not None
         self.exaggeration = float(f"{10.0**self.bending.value:.2g}")
         self.bending.label = f"bending x {self.exaggeration:g}"
-        self._changed.set()
+        self._wake.set()
 
     def _on_shown(self) -> None:
         self.shown = Shown(**{name: check.value for name, check in self.checks.items()})
-        self._changed.set()
+        self._wake.set()
 
     def _set_riding(self) -> None:
         self.riding = self.view.value == BASE
-        self._changed.set()
+        self._wake.set()
 
     def _curves(self) -> list[Curves]:
         chosen = 0 if self.chosen is None else self.chosen.options.index(self.chosen.value)
@@ -135,7 +131,7 @@ class Player:
             self.time = 0.0
         self.playing = True
         self._label_button()
-        self._changed.set()
+        self._wake.set()
 
     def pause(self) -> None:
         """Stand still."""
@@ -145,45 +141,12 @@ class Player:
     def seek(self, time: float) -> None:
         """Show a time, s."""
         self.time = float(np.clip(time, 0.0, self.end))
-        self._changed.set()
+        self._wake.set()
 
-    def wait(self) -> None:
-        """Wait until it is stopped, or Ctrl-C."""
-        try:
-            while not self._over.wait(0.5):
-                pass
-        except KeyboardInterrupt:
-            self.stop()
-
-    def stop(self) -> None:
-        """Close the page."""
-        if self._closed:
-            return
-        self._closed = True
-        self._over.set()
-        self._changed.set()
-        if self._thread is not threading.current_thread():
-            self._thread.join(timeout=5.0)
-        with quiet():
-            self.server.stop()
-
-    def __enter__(self) -> Player:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
-    def _run(self) -> None:
-        last = due = time.monotonic()
-        while not self._over.is_set():
-            changed = self._changed.wait(max(0.0, due - time.monotonic()))
-            self._changed.clear()
-            now = time.monotonic()
-            due = max(due, now - 1.0 / FRAMES) + 1.0 / FRAMES
-            moved = self._advance(now - last)
-            last = now
-            if moved or changed:
-                self._draw()
+    def _tick(self, elapsed: float, woken: bool) -> None:
+        self._wake.clear()
+        if self._advance(elapsed) or woken:
+            self._draw()
 
     def _advance(self, elapsed: float) -> bool:
         """Move the clock on, and say whether it moved; it stands while nobody looks."""
