@@ -11,6 +11,7 @@ import ssm_decouple as ssm
 from ssm_decouple.batch import Batch
 from ssm_decouple.simulation.steps import Demand, held
 from ssm_decouple.studies.postures import joint_ranges
+from ssm_decouple.studies.shares import wilson
 from ssm_decouple.studies.targets import (
     ARM,
     PROTECTIONS,
@@ -23,7 +24,6 @@ from ssm_decouple.studies.targets import (
     random_starts,
     random_targets,
     row_names,
-    wilson,
     workspace_trials,
 )
 from ssm_decouple.viewing import targets as viewing

@@ -307,12 +307,13 @@ class Campaign:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", DecoupleWarning)  # of a target out of reach, thousands of times
             for (_, protection, *_), members in groups.items():
-                _fill(found, protection, members, self._law(members[0], protection))
-                if self._engine_of(members[0][1], protection) is None:
+                law, engine = self._law(members[0], protection), self._engine_of(members[0][1], protection)
+                _fill(found, protection, members, law)
+                if engine is None:
                     for at, case, drawn in members:
                         _run_alone(found, at, self.variant(case, drawn), protection)
                 else:
-                    self._run_together(found, members, protection)
+                    _run_together(found, members, law, engine)
         return found
 
     def run(
@@ -393,24 +394,6 @@ class Campaign:
         _, case, drawn = member
         return _with_robot(replace(case, law={**case.law, **drawn.law}), case.robot).make_law(_protection(protection))
 
-    def _run_together(self, found: Rows, members: Sequence[tuple[int, Case, Drawn]], protection: str) -> None:
-        case, at = members[0][1], np.array([place for place, _, _ in members])
-        engine = self._engine_of(case, protection)
-        assert engine is not None
-        base = np.array(case.base_position)
-        starts = [
-            case.robot.configuration(drawn.joints, pin.SE3(pin.rpy.rpyToMatrix(*drawn.base_rpy), base))
-            for _, _, drawn in members
-        ]
-        targets = np.array([drawn.target for _, _, drawn in members])
-        tolerance = case.simulation.get("arrival_tolerance", 0.01)
-        law = self._law(members[0], protection)
-        motions = engine.motions(law, np.array(starts), targets, case.duration, case.dt, tolerance)
-        for name in _RESULTS:
-            found[name][at] = getattr(motions, name)
-        lost = at[motions.outcome == "undefined"]
-        found["outcome"][lost], found["error"][lost] = FAILED, _NOT_FINITE
-
     def _refuse_unfit(self, case: Case) -> None:
         """Refuse a case that the campaign's distributions do not fit, or that makes no law under a protection."""
         dynamic = isinstance(case.simulation.get("method"), Dynamic)
@@ -464,6 +447,23 @@ def results_of(motion: xr.Dataset) -> dict[str, Any]:
         "base_rotation": np.ptp(motion.base_rpy.values, axis=0),
         "smallest_singular_value": motion.smallest_singular_value.values.min(),
     }
+
+
+def _run_together(found: Rows, members: Sequence[tuple[int, Case, Drawn]], law: SelectiveLaw, engine: Batch) -> None:
+    """Have the batch engine move samples of one case under one law."""
+    case, at = members[0][1], np.array([place for place, _, _ in members])
+    base = np.array(case.base_position)
+    starts = [
+        case.robot.configuration(drawn.joints, pin.SE3(pin.rpy.rpyToMatrix(*drawn.base_rpy), base))
+        for _, _, drawn in members
+    ]
+    targets = np.array([drawn.target for _, _, drawn in members])
+    tolerance = case.simulation.get("arrival_tolerance", 0.01)
+    motions = engine.motions(law, np.array(starts), targets, case.duration, case.dt, tolerance)
+    for name in _RESULTS:
+        found[name][at] = getattr(motions, name)
+    lost = at[motions.outcome == "undefined"]
+    found["outcome"][lost], found["error"][lost] = FAILED, _NOT_FINITE
 
 
 def _run_alone(found: Rows, at: int, case: Case, protection: str) -> None:

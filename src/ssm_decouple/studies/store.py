@@ -321,12 +321,12 @@ class Store:
         return np.asarray(self._array(name)[part])
 
     def _tally(self, part: slice, there: NDArray[np.bool_]) -> Tally:
-        from scipy.stats import binomtest
+        from ssm_decouple.studies.shares import wilson
 
         kept = {name: self._column(name, part)[there] for name in _TALLIED}
         outcomes, left = kept["outcome"], kept["final_error"]
         arrived, failed = outcomes == "converged", outcomes == FAILED
-        interval = binomtest(int(arrived.sum()), len(arrived)).proportion_ci(method="wilson")
+        low, high = wilson(int(arrived.sum()), len(arrived))
         turned = [_median(np.rad2deg(kept["base_rotation"][:, axis])) for axis in range(3)]
         return Tally(
             case=str(kept["case"][0]),
@@ -334,8 +334,8 @@ class Store:
             k=int(kept["k"][0]),
             samples=len(arrived),
             arrived=float(arrived.mean()),
-            arrived_low=float(interval.low),
-            arrived_high=float(interval.high),
+            arrived_low=low,
+            arrived_high=high,
             stalled=int(np.sum(outcomes == "stalled")),
             running=int(np.sum(outcomes == "running")),
             failed=int(failed.sum()),

@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
-from scipy.stats import binomtest, norm
+from scipy.stats import norm
 
 from ssm_decouple.batch import Batch
 from ssm_decouple.batch.results import Motions
@@ -20,13 +20,13 @@ from ssm_decouple.momentum.protection import AXES, Protection
 from ssm_decouple.studies.case import Case
 from ssm_decouple.studies.comparison import UNDAMPED, laws_of
 from ssm_decouple.studies.postures import MARGIN, PROTECTIONS, joint_ranges
+from ssm_decouple.studies.shares import CONFIDENCE, wilson
 
 Floats = NDArray[np.float64]
 Flags = NDArray[np.bool_]
 Triple = tuple[float, float, float]
 
 COUNT = 10_000
-CONFIDENCE = 0.95
 DRAWN = 8192  # random starts that are looked at together
 TRIES = 64  # so many times before there seem to be none
 INTERVALS = 16  # of a joint path, over which the base is integrated
@@ -539,12 +539,6 @@ def workspace_trials(
     laws = {name: SelectiveLaw(robot, Protection(name), gain, rate_limit) for name in PROTECTIONS}
     laws["all" + UNDAMPED] = SelectiveLaw(robot, Protection("all"), gain, rate_limit, damping=0.0)
     return Trials(random_targets(robot, starts, count, seed), laws, threads=threads)
-
-
-def wilson(arrived: int, total: int) -> tuple[float, float]:
-    """Return the 95 % interval of a share, by Wilson's score."""
-    interval = binomtest(arrived, total).proportion_ci(CONFIDENCE, method="wilson")
-    return float(interval.low), float(interval.high)
 
 
 def paired_interval(only_one: int, only_other: int, total: int) -> tuple[float, float]:

@@ -20,13 +20,14 @@ from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import binomtest, qmc, t
+from scipy.stats import qmc, t
 
 from ssm_decouple.batch.engine import Batch
 from ssm_decouple.errors import InputError, as_positive, as_seed
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.studies.postures import MARGIN, PROTECTIONS, joint_ranges
+from ssm_decouple.studies.shares import CONFIDENCE, wilson
 
 Floats = NDArray[np.float64]
 Counts = NDArray[np.uint32]
@@ -448,7 +449,7 @@ def arm_joints(robot: Robot) -> list[str]:
     return [*names, *(name for name in robot.joint_names if name not in names)]
 
 
-def interval(shares: Floats, samples: int, confidence: float = 0.95) -> tuple[float, float]:
+def interval(shares: Floats, samples: int, confidence: float = CONFIDENCE) -> tuple[float, float]:
     """Return a confidence interval of a share from those of independent blocks.
 
     Each scramble is an unbiased estimate of the share, and the scrambles are independent: their spread gives Student's
@@ -466,7 +467,6 @@ def interval(shares: Floats, samples: int, confidence: float = 0.95) -> tuple[fl
     """
     mean, spread = float(np.mean(shares)), float(np.std(shares, ddof=1)) if len(shares) > 1 else 0.0
     if spread == 0.0:
-        wilson = binomtest(round(mean * samples), samples).proportion_ci(confidence, method="wilson")
-        return float(wilson.low), float(wilson.high)
+        return wilson(round(mean * samples), samples, confidence)
     low, high = t.interval(confidence, len(shares) - 1, mean, spread / np.sqrt(len(shares)))
     return max(float(low), 0.0), min(float(high), 1.0)
