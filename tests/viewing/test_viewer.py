@@ -19,12 +19,13 @@ from scipy.spatial.transform import Rotation
 import ssm_decouple as ssm
 from ssm_decouple.viewing.viewer import browser, export, law_name, scenes_of
 from ssm_decouple.viewing.viewer.live import Live, case_of
-from ssm_decouple.viewing.viewer.parts import spacecraft_parts
+from ssm_decouple.viewing.viewer.parts import antenna, bus, spacecraft_parts
 from ssm_decouple.viewing.viewer.player import numbers, status
 from ssm_decouple.viewing.viewer.plots import curves_of
 from ssm_decouple.viewing.viewer.scene import Scene, body_poses, usual_exaggeration, without_jumps
 from ssm_decouple.viewing.viewer.server import open_server
-from ssm_decouple.viewing.viewer.stage import Shown, Stage, antenna, rate_arrows
+from ssm_decouple.viewing.viewer.shapes import Trail, arrow_lengths, from_z_to, rods, simplified, way_out
+from ssm_decouple.viewing.viewer.stage import Shown, Stage
 
 MESHED = """<robot name="meshed"><link name="base"><inertial><mass value="100"/>
 <inertia ixx="9" iyy="9" izz="9" ixy="0" ixz="0" iyz="0"/></inertial></link>
@@ -123,12 +124,75 @@ def test_inertial_directions_keep_their_axes():
 
 
 def test_arrows_show_the_rates_in_one_scale_and_the_momentum_s_direction(scene):
-    frame = scene.at(2.0)._replace(free=np.array([1e-3, 0, 0]), protected=np.array([0, 0, 1e-19]))
-    free, protected, momentum = rate_arrows(frame._replace(momentum=np.array([0, 3.0, 0])), 2000.0, 16.0, True)
+    now = scene.at(2.0).vectors._replace(free=np.array([1e-3, 0, 0]), protected=np.array([0, 0, 1e-19]))
+    free, protected, momentum = arrow_lengths(now._replace(momentum=np.array([0, 3.0, 0])), 2000.0, 16.0)
     np.testing.assert_allclose(free, [2.0, 0, 0])
     np.testing.assert_allclose(protected, [0, 0, 2e-16])
     np.testing.assert_allclose(momentum, [0, 0.14 * 16.0, 0])
-    assert not rate_arrows(frame, 2000.0, 16.0, False)[2].any()
+    assert not scene.has_momentum
+    assert not arrow_lengths(now, 2000.0, 16.0)[2].any()
+
+
+def test_arrows_begin_where_their_direction_leaves_the_bus(scene, rng):
+    low, high = box = bus(scene.parts)
+    np.testing.assert_allclose([low, high], [[-1.275, -1.28, -1.275], [1.275, 1.28, 1.275]], atol=0.3)
+    for _ in range(50):
+        attitude, direction = rng.normal(size=(2, 4))
+        attitude /= np.linalg.norm(attitude)
+        direction = direction[:3] / np.linalg.norm(direction[:3])
+        way = way_out(box, attitude, direction)
+        np.testing.assert_allclose(np.cross(way, direction), 0.0, atol=1e-12)
+        end = rotation(attitude).T @ way
+        assert np.all((low <= end + 1e-9) & (end <= high + 1e-9))
+        assert np.any(np.isclose(end, low) | np.isclose(end, high))
+        np.testing.assert_allclose(rotation(from_z_to(direction))[:, 2], direction, atol=1e-12)
+    assert not way_out(box + 5.0, attitude, direction).any()
+    assert not bus([]).any()
+
+
+def test_lines_are_rods_with_their_outsides_out(rng):
+    segments = np.cumsum(rng.normal(size=(4, 2, 3)), axis=1)
+    import trimesh
+
+    for segment in segments:
+        vertices, faces = rods(segment[None], 0.01)
+        length = np.linalg.norm(segment[1] - segment[0])
+        square = 0.01 * np.sqrt(2.0)  # the side of the rod's section
+        mesh = trimesh.Trimesh(vertices, faces, process=False)
+        assert mesh.area == pytest.approx(4 * square * length)
+        assert mesh.convex_hull.volume == pytest.approx(square**2 * length)
+        middles = vertices[faces].mean(axis=1)
+        axis = (segment[1] - segment[0]) / length
+        outwards = (middles - segment[0]) - np.outer((middles - segment[0]) @ axis, axis)
+        assert np.all(np.sum(outwards * mesh.face_normals, axis=1) > 0)
+
+
+def test_a_path_is_drawn_with_few_points_and_nowhere_off():
+    t = np.linspace(0.0, 4.0, 900)
+    path = np.column_stack([np.cos(2.0 * t), np.sin(2.0 * t), 0.1 * t]) * np.minimum(t, 2.0)[:, None]
+    kept = simplified(path, 1e-3)
+    assert (kept[0], kept[-1]) == (0, 899)
+    assert 20 < len(kept) < 200
+    for i, point in enumerate(path):
+        place = min(np.searchsorted(kept, i, side="right"), len(kept) - 1)
+        a, b = path[kept[place - 1]], path[kept[place]]
+        share = np.clip((point - a) @ (b - a) / ((b - a) @ (b - a)), 0.0, 1.0)
+        assert np.linalg.norm(point - a - share * (b - a)) <= 1e-3
+    assert len(simplified(np.outer(t, [1.0, 2.0, 3.0]), 1e-9)) == 2
+    assert len(simplified(np.zeros((50, 3)), 1e-9)) == 2
+
+
+def test_a_trail_grows_and_its_rest_takes_no_room(server):
+    points = np.cumsum(np.ones((6, 3)), axis=0)
+    trail = Trail(server, "/trail", 6, (1, 2, 3), 0.01)
+    for count in (0, 1):
+        trail.draw(points[:count])
+        assert not trail.mesh.visible
+    for count in (2, 4, 6):
+        trail.draw(points[:count])
+        assert trail.mesh.visible
+        np.testing.assert_allclose(trail.mesh.vertices.max(axis=0), points[count - 1], atol=0.02)
+        np.testing.assert_allclose(trail.mesh.vertices.min(axis=0), points[0], atol=0.02)
 
 
 def test_momentum_is_told_where_there_is_some(scene):
@@ -143,7 +207,7 @@ def test_momentum_is_told_where_there_is_some(scene):
 
 def test_wings_bend_as_the_plant_s_segments_do(flexible):
     scene = Scene.of("flexible", flexible)
-    assert [wing.name for wing in scene.wings] == ["wing_left", "wing_right"]
+    assert [wing.appendage.name for wing in scene.wings] == ["wing_left", "wing_right"]
     assert not any(part.name in ("wing_left", "wing_right") for part in scene.parts)
     plant = ssm.Plant.of(ssm.load_robot("ets_vii_flexible"))
     model = plant.robot.model
@@ -156,19 +220,38 @@ def test_wings_bend_as_the_plant_s_segments_do(flexible):
         pose = data.oMf[plant.robot.frame_id(name)]
         np.testing.assert_allclose(frame.positions[place], pose.translation, atol=1e-9)
         np.testing.assert_allclose(rotation(frame.quaternions[place]), pose.rotation, atol=1e-9)
-    tip = scene.wings[0].segment()
+    tip = scene.wings[0].segment
     np.testing.assert_allclose(tip.pose.translation, [0, 3.25, 0], atol=1e-12)
     assert tip.size == (0.04, 6.5, 2.4)
+    (drawn,) = (part for part in spacecraft_parts(scene.robot) if part.name == "wing_left")
+    np.testing.assert_allclose(np.sort(scene.wings[0].plate.corners, 0), np.sort(drawn.corners, 0), atol=1e-12)
     assert 0.4 <= usual_exaggeration([scene]) * np.abs(flexible.hinge_angles.values).max() / 0.12 <= 1.0
 
 
-def test_several_segments_follow_each_other(flexible):
-    wing = dataclasses.replace(Scene.of("flexible", flexible).wings[0], segments=3, first=0)
-    known = ssm.Appendage("w", wing.root, wing.span, [1, 0, 0], 6.5, 2.4, 50.0, 0.15, 0.005, segments=3)
-    angles = np.array([0.1, -0.05, 0.2])
+def test_a_wing_of_an_own_robot_is_drawn_without_a_box_as_the_record_has_it():
+    """Three segments, turned, on a robot that no catalogue knows and whose URDF draws nothing of that name."""
+    own = ssm.load_robot("ets_vii")
+    panel = ssm.Appendage("panel", [0, 0, 1.3], [0, 0, 2], [1, 0, 0], 4.0, 1.0, 20.0, 0.2, 0.01, segments=3, turn=0.7)
+    robot = ssm.Robot(own.urdf, name="own", appendages=[panel])
+    law = ssm.SelectiveLaw(robot, ssm.Protection("none"), rate_limit=np.deg2rad(5.0))
+    q = robot.configuration(np.deg2rad([150, -20, -10, 0, 0, 0]))
+    motion = ssm.simulate(law, q, [-1.0, 0.5, 2.0], 2.0, 0.2, ssm.Dynamic(step=0.01))
+    scene = Scene.of("own", motion)
+    (wing,) = scene.wings
+    assert wing.appendage == panel
+    plant = ssm.Plant.of(robot)
+    model, angles = plant.robot.model, np.array([0.1, -0.05, 0.2])
+    q = plant.configuration(motion.configuration.values[-1], angles)
+    pin.framesForwardKinematics(model, data := model.createData(), q)
     positions, wxyz = wing.poses(angles)
+    base = data.oMi[1]
+    for i in range(3):
+        pose = base.actInv(data.oMf[plant.robot.frame_id(f"panel_segment_{i}")])
+        np.testing.assert_allclose(positions[i], pose.translation, atol=1e-12)
+        np.testing.assert_allclose(rotation(wxyz[i]), pose.rotation, atol=1e-12)
     last = positions[2] + rotation(wxyz[2]) @ (wing.span / 3)
-    assert last[0] == pytest.approx(float(known.tip_deflection(angles)))
+    assert last @ panel.turned_normal == pytest.approx(float(panel.tip_deflection(angles)))
+    np.testing.assert_allclose(np.sort(wing.segment.size), [wing.thickness, 1.0, 4.0 / 3.0])
 
 
 def test_riding_on_the_base_the_base_stands_still(scene):
@@ -196,15 +279,19 @@ def test_the_stage_sends_poses_and_shows_what_is_asked_for(motions, server):
         frame = actor.scene.at(6.0)
         for body, position in zip(actor.bodies, frame.positions, strict=True):
             np.testing.assert_allclose(body.position, position, atol=1e-4)  # viser leaves smaller changes out
-        assert sum(piece.visible for piece in actor.pieces) == np.sum(actor.times <= 6.0)
-        assert not actor.rates[2].visible
+        tool = actor.scene.motion.end_effector_position.sel(time=slice(0.0, 6.0)).values
+        np.testing.assert_allclose(actor.trail.mesh.vertices.max(axis=0), tool.max(axis=0), atol=0.05)
+        np.testing.assert_allclose(actor.trail.mesh.vertices.min(axis=0), tool.min(axis=0), atol=0.05)
+        assert not actor.arrows.rates[2].visible
     none, selective, *_ = stage.actors
-    assert none.rates[0].visible
-    assert [arrow.visible for arrow in selective.axes] == [True, True]
-    length = np.ptp(none.rates[0].points[0], axis=0)
-    assert np.linalg.norm(length) == pytest.approx(np.linalg.norm(stage.rate_scale * scenes[0].at(6.0).free), rel=1e-5)
+    free, now = none.arrows.rates[0], scenes[0].at(6.0).vectors
+    assert free.visible
+    assert [arrow.visible for arrow in selective.arrows.directions] == [True, True]
+    assert free.scale[2] == pytest.approx(np.linalg.norm(stage.rate_scale * now.free))
+    np.testing.assert_allclose(rotation(free.wxyz)[:, 2], now.free / np.linalg.norm(now.free), atol=1e-4)
     stage.draw(3.0, shown=Shown(axes=False, rates=False, path=False, sight=False))
-    assert not any(arrow.visible for arrow in [*selective.axes, *none.rates, *none.pieces, *none.sight])
+    hidden = [*selective.arrows.directions, *none.arrows.rates, none.trail.mesh, *none.sight]
+    assert not any(node.visible for node in hidden)
     assert np.ptp(stage.offsets[:, 2]) > 0
     apart = np.diff(stage.offsets[:, 2])
     assert np.all(-apart > scenes[0].box[1, 2] - scenes[0].box[0, 2])
@@ -480,15 +567,40 @@ def test_protections_change_on_the_way_and_reactionless_control_refuses(live):
     np.testing.assert_allclose(live.q[3:7], base[3:7], atol=1e-9)
     assert "stalled" in live._state()
     assert "no way on" in live._state()
-    assert len(live.arrows) == 3
+    assert len(live.arrows.directions) == 3
+    assert not any(arrow.visible for arrow in live.arrows.rates)
     live.protect("none")
     live._draw()
-    assert len(live.arrows) == 0
+    assert len(live.arrows.directions) == 0
     for _ in range(20):
         live.advance(1.0)
     assert live.outcome() == "arrived"
     with pytest.raises(ssm.InputError, match="one of none, yaw"):
         live.protect("pitch")
+
+
+def test_live_arrows_are_those_of_the_record(live):
+    """What the page draws of the law's rates is what a recorded motion of it draws, and its momentum too."""
+    live.restart()
+    live.drag(np.array(live.case.target))
+    live.protect("the case's own")
+    live._wake.clear()
+    live.law.momentum = [0.1, 0.0, 0.0, 0.0, 0.3, 0.4]
+    try:
+        live._ask()
+        now = live._vectors(body_poses(live.robot, live.q[None], live.joints)[0, 0])
+        scene = Scene.of("it", ssm.simulate(live.law, live.q, live.case.target, 0.2, 0.1))
+        recorded = scene.at(0.0).vectors
+        np.testing.assert_allclose(now.free, recorded.free, rtol=1e-9)
+        assert np.linalg.norm(now.protected) < 1e-15
+        np.testing.assert_allclose(now.momentum, recorded.momentum, atol=1e-9)
+        for one, other in zip(now[:4], recorded[:4], strict=True):
+            np.testing.assert_allclose(one, other, atol=1e-12)
+        live._draw()
+        free, protected, momentum = live.arrows.rates
+        assert (free.visible, protected.visible, momentum.visible) == (True, False, True)
+    finally:
+        live.law.momentum = None
 
 
 def test_a_robot_can_be_live_and_a_case_of_other_tasks_cannot(write):

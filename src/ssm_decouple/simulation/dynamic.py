@@ -376,6 +376,7 @@ class DynamicMotion:
         drift = np.abs(change - change[0]).reshape(-1, 2, 3).max((0, 2))
         motion.attrs |= {
             "physics": json.dumps(self.settings.describe()),
+            "appendages": json.dumps([asdict(appendage) for appendage in self.plant.appendages]),
             "energy_error": float(np.abs(energy - energy[0] - work).max() / max(energy.max(), TINY)),
             "momentum_drift": float(np.max(drift / carried)),
             "largest_torques": json.dumps(self.torques[1].tolist()),

@@ -93,8 +93,9 @@ def simulate(
         it, each row with its name and `task_level`; where no task asks for a position of the end-effector, its
         target and error are not numbers. A dynamic motion has also joint_velocities, joint_torques,
         hinge_angles, tip_deflection, kinetic_energy, spring_energy, drive_work, load_work, damping_loss,
-        saturated_time, and the attributes `physics`, `energy_error`, `momentum_drift` (both relative),
-        `largest_torques` and `saturated`: from when to when a drive stood at its torque limit.
+        saturated_time, and the attributes `physics`, `appendages` (JSON: what `Appendage` is made of), `energy_error`,
+        `momentum_drift` (both relative), `largest_torques` and `saturated`: from when to when a drive stood at its
+        torque limit.
 
     Raises:
         InputError: an argument makes no sense; the message names it.

@@ -26,11 +26,23 @@ from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.motion import judge
 from ssm_decouple.studies.case import Case, cases, load_case
 from ssm_decouple.viewing.viewer.page import Page
-from ssm_decouple.viewing.viewer.parts import Part, spacecraft_parts
+from ssm_decouple.viewing.viewer.parts import Part, antenna, spacecraft_parts
 from ssm_decouple.viewing.viewer.plots import AXES, FLOOR, HEIGHT, POINTS, caption
-from ssm_decouple.viewing.viewer.scene import body_poses
+from ssm_decouple.viewing.viewer.scene import Vectors, body_poses, rotated, split_rate
 from ssm_decouple.viewing.viewer.server import HOST, PORT
-from ssm_decouple.viewing.viewer.stage import FAINT, PATH, PROTECTED, SIGHT, TARGET, add_part, antenna, sight_line
+from ssm_decouple.viewing.viewer.shapes import (
+    FAINT,
+    LEGEND,
+    LONGEST,
+    PATH,
+    SIGHT,
+    TARGET,
+    Arrows,
+    Trail,
+    add_lines,
+    add_part,
+    sight_line,
+)
 
 Floats = NDArray[np.float64]
 
@@ -38,6 +50,7 @@ TEXTS = 4  # a second
 PACES = ("1", "2", "5", "10", "20")
 KEPT = 4000  # samples of the past, for the plots and to judge what has stalled
 TRAIL = 300
+USUAL = 0.2  # of the base rate that one joint causes at its limit: the longest arrow, until there has been more
 QUIET = 1e-7  # rad/s: slower joints are at rest on a page
 FOLLOWED = 60.0  # s: what the plots show
 _PLOTS = (("left (mm), the last minute", "#56B4E9"), ("|w_sub| (10^x rad/s), the last minute", "#CC79A7"))
@@ -161,9 +174,11 @@ class Live(Page):
         self.size = max(2.0 * self.robot.reach, _width(parts))
         found = antenna(parts)
         if found is not None:
-            foot, line = found[0], sight_line(found[1], self.size)
-            scene.add_line_segments("/spacecraft/body_0/line_of_sight", line, np.array(SIGHT), position=foot)
-        self.U_c = scene.add_frame("/spacecraft/U_c", show_axes=False)
+            line, name = sight_line(found[1], self.size), "/spacecraft/body_0/line_of_sight"
+            add_lines(self.server, name, line, SIGHT, 0.0014 * self.size, position=found[0])
+        self.arrows = Arrows(self.server, "/spacecraft", self.size, parts)
+        self._largest = USUAL * self._fastest_joint()
+        self._protected: str | None = None
         reach, place = self.robot.reach, self.robot.shoulder_position(q)
         start = self.target.translation if self.posed else self.target
         self.handle = scene.add_transform_controls(
@@ -177,8 +192,8 @@ class Live(Page):
         )
         self.handle.on_update(lambda _: self.drag(self.handle.position, self.handle.wxyz))
         scene.add_icosphere("/target/ball", radius=0.035 * reach, color=TARGET)
-        self.trail = scene.add_line_segments("/trail", np.zeros((1, 2, 3)), np.array(PATH), thickness=0.008 * reach)
-        self.gap = scene.add_line_segments("/gap", np.zeros((1, 2, 3)), np.array(FAINT), thickness=0.004 * reach)
+        self.trail = Trail(self.server, "/trail", TRAIL, PATH, 0.004 * reach)
+        self.gap = Trail(self.server, "/gap", 2, FAINT, 0.002 * reach)
         middle = 0.5 * (place + start)
         camera = self.server.initial_camera
         camera.look_at = middle
@@ -198,34 +213,16 @@ class Live(Page):
         self.speed = gui.add_dropdown("speed", tuple(f"{word} x" for word in PACES), initial_value="5 x")
         back = gui.add_button("back to the start", icon=viser.Icon.REFRESH)
         self.state = gui.add_html(self._state())
+        gui.add_html(LEGEND)
         self._add_plots()
         self.protection.on_update(lambda event: self.protect(self.protection.value) if event.client else None)
         self.speed.on_update(lambda _: setattr(self, "pace", float(self.speed.value.split()[0])))
         back.on_click(lambda _: self.restart())
-        self.arrows: list[viser.ArrowsHandle] = []
-        self._arrows()
 
-    def _arrows(self) -> None:
-        """Draw the directions that the present law protects."""
-        U_twist, _ = self.law.directions
-        for handle in self.arrows:
-            handle.remove()
-        length, reach = 0.16 * self.size, self.robot.reach
-        self.arrows = []
-        for i, column in enumerate(U_twist.T):
-            direction = column[3:] if not np.any(column[:3]) else column[:3]
-            ends = np.array([[-length * direction, length * direction]])
-            self.arrows.append(
-                self.server.scene.add_arrows(
-                    f"/spacecraft/U_c/{i}",
-                    ends,
-                    np.array(PROTECTED),
-                    shaft_radius=0.012 * reach,
-                    head_radius=0.03 * reach,
-                    head_length=0.1 * reach,
-                )
-            )
-        self._drawn_for = self.chosen
+    def _fastest_joint(self) -> float:
+        """Return the fastest, rad/s, that one joint alone turns the base at the start."""
+        rates = np.where(np.isfinite(self.law.rate_limits), self.law.rate_limits, 1.0)
+        return float(np.max(rates * np.linalg.norm(self.robot.coupling(self.q).J_rc, axis=0)))
 
     def _tick(self, elapsed: float, woken: bool) -> None:
         self.advance(min(elapsed, 0.25))
@@ -285,24 +282,33 @@ class Live(Page):
         with self.server.atomic():
             for body, pose in zip(self.bodies, moved, strict=True):
                 body.position, body.wxyz = pose[:3], pose[3:]
-            self.U_c.position = moved[0, :3]
-            frame = self.law.directions[1]
-            self.U_c.wxyz = moved[0, 3:] if frame == "base" else self._axes(frame)
-            if self._drawn_for != self.chosen:
-                self._arrows()
+            if self._protected != self.chosen:
+                self.arrows.protect(self.law.directions[0])
+                self._protected = self.chosen
+            vectors = self._vectors(moved[0])
+            self._largest = max(self._largest, float(np.linalg.norm(vectors.free + vectors.protected)))
+            self.arrows.draw(vectors, LONGEST * self.size / self._largest)
             now = time.monotonic()
             if now - self._told > 1.0 / TEXTS:
                 self._told = now
                 place = self.target.translation if self.posed else self.target
-                self.gap.points = np.array([[error, place]], dtype=np.float32)
-                if len(self.past.trail) > 1:
-                    trail = np.array(self.past.trail)
-                    self.trail.points = np.stack([trail[:-1], trail[1:]], axis=1).astype(np.float32)
+                self.gap.draw(np.array([error, place]))
+                self.trail.draw(np.array(self.past.trail))
                 self.state.content = self._state()
                 columns = self._columns()
                 for plot, values in zip(self.plots, columns[1:], strict=True):
                     plot.data = (columns[0], values)
         self.frames += 1
+
+    def _vectors(self, base: Floats) -> Vectors:
+        """Return what the arrows show, of the base's pose (7,): the rates that the law commands, and its momentum."""
+        directions, frame = self.law.directions
+        axes = base[3:] if frame == "base" else self._axes(frame)
+        told = self.law.shares(np.array([self.clock]), self.q[None])
+        shares = np.ones(directions.shape[1]) if told is None else told[0]
+        rate = rotated(base[3:], self.values[3:6])
+        free, protected = split_rate(rate[None], directions[:, shares > 0], axes[None])[:, 0]
+        return Vectors(base[:3], base[3:], axes, shares, free, protected, self.law.momentum[3:])
 
     def _axes(self, frame: str) -> Floats:
         if frame == "inertial":
@@ -452,5 +458,5 @@ def live(source: str | Case, host: str = HOST, port: int = PORT, mesh_folders: t
 
 def _width(parts: list[Part]) -> float:
     """Return how wide the base's shapes are, m."""
-    corners = [part.pose.act(corner) for part in parts if part.joint == 1 for corner in part.extent]
-    return float(np.ptp(np.array(corners), axis=0).max()) if corners else 1.0
+    corners = [part.corners for part in parts if part.joint == 1]
+    return float(np.ptp(np.vstack(corners), axis=0).max()) if corners else 1.0

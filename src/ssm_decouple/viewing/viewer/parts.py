@@ -66,6 +66,12 @@ class Part:
             half = np.full(3, self.size[0])
         return np.array([-half, half])
 
+    @property
+    def corners(self) -> Floats:
+        """Corners of the box around the shape (8, 3), m, in the axes of the joint."""
+        corners = np.array(np.meshgrid(*self.extent.T)).reshape(3, -1).T
+        return corners @ self.pose.rotation.T + self.pose.translation
+
 
 def spacecraft_parts(
     robot: Robot, turned: Mapping[str, float] | None = None, mesh_folders: Sequence[str | Path] = ()
@@ -89,6 +95,33 @@ def spacecraft_parts(
         found.append(Part(shape.name, shape.link, joint, shape.kind, shape.size, link * pose, shape.color))
     found += _meshes(robot, [*map(Path, mesh_folders), *_usual_folders()])
     return found or _skeleton(robot)
+
+
+def antenna(parts: Sequence[Part]) -> tuple[Floats, Floats] | None:
+    """Return where an antenna on the base stands (3,) and where it looks (3,), base axes; None where there is none.
+
+    It is the widest cylinder on the base whose name says antenna or dish; it looks along its axis, outwards.
+    """
+    named = [
+        part
+        for part in parts
+        if part.joint == 1 and part.kind == "cylinder" and ("antenna" in part.name or "dish" in part.name)
+    ]
+    if not named:
+        return None
+    dish = max(named, key=lambda part: part.size[0])
+    axis, foot = dish.pose.rotation[:, 2], dish.pose.translation
+    return foot.copy(), axis if axis @ foot >= 0 else -axis
+
+
+def bus(parts: Sequence[Part]) -> Floats:
+    """Return lowest and highest corner (2, 3), m, base axes, of what on the base takes the most room.
+
+    That is one shape, so that wings do not count. Without any it is a point.
+    """
+    shapes = [part.corners for part in parts if part.joint == 1]
+    boxes = [np.array([corners.min(axis=0), corners.max(axis=0)]) for corners in shapes]
+    return max(boxes, key=lambda box: float(np.prod(box[1] - box[0])), default=np.zeros((2, 3)))
 
 
 def _carrier(robot: Robot, link: str) -> tuple[int, pin.SE3]:

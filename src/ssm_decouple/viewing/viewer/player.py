@@ -14,7 +14,8 @@ from ssm_decouple.viewing.viewer.page import Page
 from ssm_decouple.viewing.viewer.plots import Curves, Plots, curves_of, law_colors
 from ssm_decouple.viewing.viewer.scene import Scene, usual_exaggeration
 from ssm_decouple.viewing.viewer.server import HOST, PORT
-from ssm_decouple.viewing.viewer.stage import FREE, MOMENTUM, PATH, PROTECTED, SIGHT, TARGET, Shown, Stage
+from ssm_decouple.viewing.viewer.shapes import LEGEND
+from ssm_decouple.viewing.viewer.stage import Shown, Stage
 
 TEXTS = 6  # a second: numbers and cursors, which no eye follows faster
 REST = 1.5  # s: at the end, before the motion begins again
@@ -78,7 +79,7 @@ class Player(Page):
             self.bending.on_update(lambda _: self._on_bending())
             self._on_bending()
         self.table = gui.add_html(self._table())
-        gui.add_html(_LEGEND)
+        gui.add_html(LEGEND)
         self.chosen = None
         if len(self.scenes) > 1:
             names = tuple(_distinct([scene.name for scene in self.scenes]))
@@ -222,23 +223,3 @@ def _row(scene: Scene, color: str, now: float) -> str:
 
 def _distinct(names: Sequence[str]) -> list[str]:
     return [name if names.count(name) == 1 else f"{name} ({i + 1})" for i, name in enumerate(names)]
-
-
-def _square(color: tuple[int, int, int], text: str) -> str:
-    return f'<span style="color:rgb{color}">&#9632;</span>&nbsp;{text}'
-
-
-_LEGEND = (
-    '<div style="font-size:0.78em;padding:0.2em 0.9em;line-height:1.5">'
-    + " &ensp;".join(
-        [
-            _square(PROTECTED, "U_c, protected rate"),
-            _square(FREE, "free rate"),
-            _square(MOMENTUM, "momentum"),
-            _square(PATH, "path"),
-            _square(TARGET, "target"),
-            _square(SIGHT, "line of sight"),
-        ]
-    )
-    + "</div>"
-)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
@@ -20,44 +20,52 @@ from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.simulation.motion import error_of, robot_of, rotations_to
 from ssm_decouple.studies.comparison import disturbance
-from ssm_decouple.viewing.viewer.parts import Part, spacecraft_parts
+from ssm_decouple.viewing.viewer.parts import Color, Part, spacecraft_parts
 
 Floats = NDArray[np.float64]
 
 LARGEST_BEND = 0.12  # rad: what the exaggeration makes of the largest hinge angle to begin with
 NOTHING = 1e-9  # momentum below this share of what the whole carries at the joints' pace is rounding
+PLATE, PANEL = 0.006, (0.03, 0.08, 0.3)  # an appendage that no box draws: its thickness, of its span, and its colour
 _SAMPLES = 25  # at which the room that a motion takes is measured
 
 
 @dataclass(frozen=True)
 class Wing:
-    """An appendage that bends: boxes on hinges, fixed to the base.
+    """An appendage that bends: plates on hinges, fixed to the base.
 
     Attributes:
-        name: Of the appendage.
-        root: Where its first hinge stands (3,), m, base axes.
-        span: From root to tip (3,), m, base axes.
-        axis: Of every hinge (3,), unit, base axes.
+        appendage: The appendage.
         first: Its first hinge among those of the record.
-        segments: Number of segments.
-        part: The box that draws it straight.
+        thickness: Of its plates, m.
+        color: Of its plates.
     """
 
-    name: str
-    root: Floats
-    span: Floats
-    axis: Floats
+    appendage: Appendage
     first: int
-    segments: int
-    part: Part
+    thickness: float
+    color: Color
 
+    @property
+    def span(self) -> Floats:
+        """From root to tip (3,), m, base axes."""
+        return self.appendage.span * np.array(self.appendage.span_direction)
+
+    @property
+    def plate(self) -> Part:
+        """The whole, straight, in base axes."""
+        return self._box(1, np.array(self.appendage.mount))
+
+    @property
     def segment(self) -> Part:
-        """Return the shape of one segment, in axes parallel to the base's, from its hinge."""
-        step = self.span / self.segments
-        R = self.part.pose.rotation
-        along = int(np.argmax(np.abs(R.T @ self.span)))
-        size = tuple(x / self.segments if i == along else x for i, x in enumerate(self.part.size))
-        return replace(self.part, size=size, pose=pin.SE3(R, 0.5 * step))
+        """The shape of one segment, in axes parallel to the base's when nothing bends, from its hinge."""
+        return self._box(self.appendage.segments, np.zeros(3))
+
+    def _box(self, parts: int, root: Floats) -> Part:
+        wing = self.appendage
+        R = np.column_stack([wing.turned_normal, wing.span_direction, -wing.hinge_axis])
+        size = (self.thickness, wing.span / parts, wing.chord)
+        return Part(wing.name, "", 1, "box", size, pin.SE3(R, root + 0.5 * self.span / parts), self.color)
 
     def poses(self, angles: Floats) -> tuple[Floats, Floats]:
         """Return where the segments stand in base axes.
@@ -68,40 +76,55 @@ class Wing:
         Returns:
             Positions (.., segments, 3), m, and quaternions (.., segments, 4), w x y z.
         """
-        total = np.cumsum(angles[..., self.first : self.first + self.segments], axis=-1)
+        segments, axis, root = self.appendage.segments, self.appendage.hinge_axis, np.array(self.appendage.mount)
+        total = np.cumsum(angles[..., self.first : self.first + segments], axis=-1)
         half = 0.5 * total[..., None]
-        wxyz = np.concatenate([np.cos(half), np.sin(half) * self.axis], axis=-1)
-        step = self.span / self.segments
-        lifted = np.cos(total)[..., None] * step + np.sin(total)[..., None] * np.cross(self.axis, step)
-        ends = self.root + np.cumsum(lifted, axis=-2)
-        starts = np.concatenate([np.broadcast_to(self.root, ends[..., :1, :].shape), ends[..., :-1, :]], axis=-2)
+        wxyz = np.concatenate([np.cos(half), np.sin(half) * axis], axis=-1)
+        step = self.span / segments
+        lifted = np.cos(total)[..., None] * step + np.sin(total)[..., None] * np.cross(axis, step)
+        ends = root + np.cumsum(lifted, axis=-2)
+        starts = np.concatenate([np.broadcast_to(root, ends[..., :1, :].shape), ends[..., :-1, :]], axis=-2)
         return starts, wxyz
 
 
+class Vectors(NamedTuple):
+    """What the arrows on a base show, in inertial axes.
+
+    Attributes:
+        base: Where it is (3,), m.
+        attitude: Its quaternion w x y z (4,).
+        axes: Quaternion w x y z of the axes in which U_c is fixed (4,).
+        shares: How far each column of U_c is protected (k,), 0 to 1.
+        free: Base angular velocity but for its protected part (3,), rad/s.
+        protected: Its protected part (3,), rad/s.
+        momentum: Angular momentum about the centre of mass (3,), N m s; zero where there is nothing but rounding.
+    """
+
+    base: Floats
+    attitude: Floats
+    axes: Floats
+    shares: Floats
+    free: Floats
+    protected: Floats
+    momentum: Floats
+
+
 class Frame(NamedTuple):
-    """A motion at one time. Quaternions are w x y z; vectors are in inertial axes.
+    """A motion at one time. Quaternions are w x y z.
 
     Attributes:
         sample: The sample at or before it.
-        positions: Of the bodies (b, 3), m.
+        positions: Of the bodies (b, 3), m, inertial axes.
         quaternions: Of the bodies (b, 4), body to inertial.
-        target: (3,), m; not numbers where there is none.
-        axes: Quaternion of the axes in which U_c is fixed (4,).
-        free: Base angular velocity but for its protected part (3,), rad/s.
-        protected: Its protected part (3,), rad/s.
-        momentum: Angular momentum about the centre of mass (3,), N m s.
-        centre: Centre of mass (3,), m.
+        target: (3,), m, inertial axes; not numbers where there is none.
+        vectors: What the arrows show.
     """
 
     sample: int
     positions: Floats
     quaternions: Floats
     target: Floats
-    axes: Floats
-    free: Floats
-    protected: Floats
-    momentum: Floats
-    centre: Floats
+    vectors: Vectors
 
 
 @dataclass(frozen=True)
@@ -152,8 +175,8 @@ class Scene:
         turned = json.loads(motion.attrs.get("turned", "{}"))
         parts = spacecraft_parts(robot, turned, mesh_folders)
         wings = _wings(motion, parts)
-        bending = [wing.part for wing in wings]
-        rigid = tuple(part for part in parts if not any(part is other for other in bending))
+        bending = {wing.appendage.name for wing in wings}
+        rigid = tuple(part for part in parts if part.joint > 1 or part.name not in bending)
         joints = (1, *sorted({part.joint for part in rigid} - {1}))
         configurations = motion.configuration.values
         axes = _axes(robot, motion)
@@ -186,11 +209,6 @@ class Scene:
         return self.motion.target_position.values
 
     @cached_property
-    def centres(self) -> Floats:
-        """Centre of mass (m, 3), m."""
-        return self.motion.centre_of_mass.values
-
-    @cached_property
     def distance(self) -> Floats:
         """Distance to the target, or the norm of the errors of level 1 (m,), m."""
         return error_of(self.motion)
@@ -205,15 +223,13 @@ class Scene:
     def box(self) -> Floats:
         """The room that the spacecraft, its path and its target take, lowest and highest corner (2, 3), m."""
         points = [self.motion.end_effector_position.values, self.motion.target_position.values]
-        everything = [*self.parts, *(wing.part for wing in self.wings)]
+        everything = [*self.parts, *(wing.plate for wing in self.wings)]
         which = {joint: place for place, joint in enumerate(self.joints)}
         for sample in np.unique(np.linspace(0, len(self.time) - 1, _SAMPLES).astype(int)):
             for part in everything:
-                corners = np.array(np.meshgrid(*part.extent.T)).reshape(3, -1)
-                corners = part.pose.rotation @ corners + part.pose.translation[:, None]
                 pose = self.body_poses[sample, which[part.joint]]
                 R = Rotation.from_quat(pose[[4, 5, 6, 3]]).as_matrix()
-                points.append((R @ corners).T + pose[:3])
+                points.append(part.corners @ R.T + pose[:3])
         cloud = np.vstack(points)
         return np.array([np.nanmin(cloud, axis=0), np.nanmax(cloud, axis=0)])
 
@@ -239,11 +255,15 @@ class Scene:
             positions=positions,
             quaternions=quaternions,
             target=between(self.targets),
-            axes=unit(between(self.axes)),
-            free=self.rates[0, i],
-            protected=self.rates[1, i],
-            momentum=self.angular_momentum[i],
-            centre=between(self.centres),
+            vectors=Vectors(
+                base=positions[0],
+                attitude=quaternions[0],
+                axes=unit(between(self.axes)),
+                shares=self.shares[i],
+                free=self.rates[0, i],
+                protected=self.rates[1, i],
+                momentum=self.angular_momentum[i] * self.has_momentum,
+            ),
         )
 
     def _segments(self, angles: Floats, base: Floats, attitude: Floats) -> tuple[Floats, Floats]:
@@ -297,6 +317,11 @@ def unit(quaternions: Floats) -> Floats:
     return quaternions / np.linalg.norm(quaternions, axis=-1, keepdims=True)
 
 
+def rotated(wxyz: Floats, vector: Floats) -> Floats:
+    """Return a vector (3,) turned by a quaternion (4,)."""
+    return pin.Quaternion(*map(float, wxyz)).toRotationMatrix() @ vector
+
+
 def _se3(pose: Floats) -> pin.SE3:
     return pin.XYZQUATToSE3(np.r_[pose[:3], pose[4:7], pose[3]])
 
@@ -345,25 +370,31 @@ def _shares(motion: xr.Dataset) -> Floats:
 
 
 def _split_rates(motion: xr.Dataset, axes: Floats) -> Floats:
-    """Return the base angular velocity in inertial axes (2, m, 3): its free part, then its protected one.
+    """Return the base angular velocity in inertial axes (2, m, 3): its free part, then its protected one."""
+    rates = Rotation.from_quat(motion.base_quaternion.values).apply(motion.base_angular_velocity.values)
+    U_c, active = motion.U_c.values, _shares(motion) > 0
+    split = np.empty((2, *rates.shape))
+    for kind in np.unique(active, axis=0):
+        which = np.all(active == kind, axis=1)
+        split[:, which] = split_rate(rates[which], U_c[:, kind], axes[which])
+    return split
+
+
+def split_rate(rates: Floats, U_twist: Floats, axes: Floats) -> Floats:
+    """Return the free and the protected part (2, m, 3) of angular velocities.
 
     Where protected directions have linear parts no part of the angular velocity alone is protected, and all is free.
+
+    Args:
+        rates: (m, 3), rad/s, inertial axes.
+        U_twist: Protected directions, twists (6, k).
+        axes: Quaternions w x y z (m, 4) of the axes in which these are fixed.
     """
-    attitude = Rotation.from_quat(motion.base_quaternion.values)
-    rates = attitude.apply(motion.base_angular_velocity.values)
-    U_c, shares = motion.U_c.values, _shares(motion)
-    split = np.array([rates, np.zeros_like(rates)])
-    if np.any(U_c[:3]):
-        return split
-    turn = Rotation.from_quat(axes[:, [1, 2, 3, 0]])
-    here = turn.inv().apply(rates)
-    for active in np.unique(shares > 0, axis=0):
-        basis = np.linalg.qr(U_c[3:, active])[0] if active.any() else np.zeros((3, 0))
-        which = np.all((shares > 0) == active, axis=1)
-        held = here[which] @ basis @ basis.T
-        split[1, which] = turn[which].apply(held)
-        split[0, which] = turn[which].apply(here[which] - held)
-    return split
+    held = np.zeros_like(rates)
+    if U_twist.size and not np.any(U_twist[:3]):
+        turn, basis = Rotation.from_quat(axes[:, [1, 2, 3, 0]]), np.linalg.qr(U_twist[3:])[0]
+        held = turn.apply(turn.inv().apply(rates) @ basis @ basis.T)
+    return np.array([rates - held, held])
 
 
 def _protected_rate(motion: xr.Dataset) -> Floats | None:
@@ -376,34 +407,13 @@ def _usual_momentum(robot: Robot, motion: xr.Dataset) -> float:
 
 
 def _wings(motion: xr.Dataset, parts: Sequence[Part]) -> tuple[Wing, ...]:
-    """Return the appendages that a box of their name draws."""
-    if "hinge_angles" not in motion:
-        return ()
-    known = _catalogued(motion)
-    hinges = [str(hinge).rsplit("_hinge_", 1)[0] for hinge in motion.hinge.values]
-    wings = []
-    for name in map(str, motion.appendage.values):
-        part = next((part for part in parts if part.name == name and part.kind == "box" and part.joint == 1), None)
-        if part is not None:
-            wings.append(_wing(name, part, known.get(name), hinges))
+    """Return the appendages that bend. The box on the base that has the name of one is what draws it straight."""
+    wings: list[Wing] = []
+    first = 0
+    for entry in json.loads(motion.attrs.get("appendages", "[]")):
+        appendage = Appendage(**entry)
+        box = next((part for part in parts if (part.name, part.kind, part.joint) == (appendage.name, "box", 1)), None)
+        thickness, color = (PLATE * appendage.span, PANEL) if box is None else (min(box.size), box.color)
+        wings.append(Wing(appendage, first, thickness, color))
+        first += appendage.segments
     return tuple(wings)
-
-
-def _wing(name: str, part: Part, appendage: Appendage | None, hinges: Sequence[str]) -> Wing:
-    size, R, middle = np.array(part.size), part.pose.rotation, part.pose.translation
-    thin = int(np.argmin(size))
-    along = max((i for i in range(3) if i != thin), key=lambda i: abs(R[:, i] @ middle))
-    span = R[:, along] * size[along] * (1.0 if R[:, along] @ middle > 0 else -1.0)
-    # The record says how far a wing bends, not which side of it is up: the robot's own file does, where it is known.
-    up = np.array(appendage.normal) if appendage is not None else R[:, thin] * np.sign(R[:, thin].sum() or 1.0)
-    normal = R[:, thin] * (1.0 if R[:, thin] @ up >= 0 else -1.0)
-    axis = np.cross(span / np.linalg.norm(span), normal)
-    return Wing(name, middle - 0.5 * span, span, axis, hinges.index(name), hinges.count(name), part)
-
-
-def _catalogued(motion: xr.Dataset) -> dict[str, Appendage]:
-    from ssm_decouple.model.catalogue import load_robot, models
-
-    if motion.attrs["robot"] not in models():
-        return {}
-    return {appendage.name: appendage for appendage in load_robot(motion.attrs["robot"]).appendages}

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 PORT = 8080
+SKY, GROUND, FILL = (230, 236, 255), (150, 148, 142), 2.1  # the light that no lamp gives, from above and from below
 WIDTH = 380  # pixels: of the controls, in which the table has to fit
 
 
@@ -46,8 +47,11 @@ def open_server(host: str = HOST, port: int = PORT, dark: bool = True, panel: bo
     if port and server.get_port() != port:
         warnings.warn(f"port {port} is taken; using {server.get_port()}", DecoupleWarning, stacklevel=3)
     server.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False, control_width="large")
-    # Shadows cost more than all the rest of a frame where there is no graphics card.
+    # Shadows, and light from a picture of surroundings, cost more than all the rest of a frame where there is no
+    # graphics card. There are none around a satellite.
     server.scene.configure_default_lights(enabled=True, cast_shadow=False)
+    server.scene.configure_environment_map(None)
+    server.scene.add_light_hemisphere("/fill", sky_color=SKY, ground_color=GROUND, intensity=FILL)
     if panel:
         server.gui.main_panel.dock_right()
         server.gui.main_panel.set_width(WIDTH)
