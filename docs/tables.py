@@ -261,6 +261,8 @@ KEPT: dict[str, Callable[[], str]] = {
     "workspace_stops": workspace_tables.stops,
     "reactionless": reactionless,
     "batch_speed": lambda: printed_by("benchmarks/batch.py", "1e7"),
+    "arms": lambda: printed_by("benchmarks/arms.py"),
+    "start_up": lambda: printed_by("benchmarks/start_up.py"),
     "viewer_speed": lambda: printed_by("benchmarks/viewer.py"),
     "campaign": lambda: printed_by("benchmarks/campaign.py"),
 }

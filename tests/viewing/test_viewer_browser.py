@@ -10,6 +10,7 @@ import io
 import shutil
 import time
 from pathlib import Path
+from urllib.request import urlopen
 
 import numpy as np
 import pytest
@@ -68,11 +69,14 @@ def visit(chromium):
 
 
 def until(page, reached, what):
-    """Wait, with the page alive, until something is so."""
+    """Wait, with the page alive where there is one, until something is so."""
     end = time.monotonic() + PATIENCE / 1e3
     while not reached():
         assert time.monotonic() < end, f"waited in vain for {what}"
-        page.wait_for_timeout(150)
+        if page is None:
+            time.sleep(0.15)
+        else:
+            page.wait_for_timeout(150)
 
 
 def nodes(page):
@@ -158,6 +162,12 @@ def test_the_target_is_dragged_by_the_mouse(visit):
         until(page, lambda: "all rotation" in page.content(), "the page's answer")
         pixels(page, "live")
         assert page.complaints == []
+        page.close()
+        until(None, lambda: not live.server.get_clients(), "the end of the page")
+        clock = live.clock
+        until(None, lambda: live.clock > clock + 1.0, "the law, which goes on without a page")
+        with urlopen(live.url) as answer:
+            assert answer.status == 200
 
 
 def on_screen(page, camera, point):
