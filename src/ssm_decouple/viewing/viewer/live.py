@@ -175,7 +175,7 @@ class Live(Page):
         found = antenna(parts)
         if found is not None:
             line, name = sight_line(found[1], self.size), "/spacecraft/body_0/line_of_sight"
-            add_lines(self.server, name, line, SIGHT, 0.0014 * self.size, position=found[0])
+            add_lines(self.server, name, line, SIGHT, 0.0018 * self.size, position=found[0])
         self.arrows = Arrows(self.server, "/spacecraft", self.size, parts)
         self._largest = USUAL * self._fastest_joint()
         self._protected: str | None = None

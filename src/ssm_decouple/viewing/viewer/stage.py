@@ -158,11 +158,11 @@ class Actor:
         """Add the path of the end-effector, and over it what has been of it, which grows from time to time."""
         path, size = self.scene.motion.end_effector_position.values, self.size
         kept = simplified(path, COARSE * size)
-        add_lines(self.server, f"{self.root}/path", joined(path[kept]), FAINT, 0.0007 * size)
+        add_lines(self.server, f"{self.root}/path", joined(path[kept]), FAINT, 0.0009 * size)
         pieces = np.linspace(0, len(path) - 1, min(PIECES, len(path) - 1) + 1).astype(int)
         grown = np.union1d(kept, pieces)
         self.grown, self.times, self.done = path[grown], self.scene.time[grown], 0
-        self.trail = Trail(self.server, f"{self.root}/trail", len(grown), PATH, 0.0017 * size)
+        self.trail = Trail(self.server, f"{self.root}/trail", len(grown), PATH, 0.0022 * size)
 
     def _add_sight(self) -> list[Any]:
         """Add the line of sight of an antenna, now and at the start."""
@@ -172,7 +172,7 @@ class Actor:
         foot, direction = found
         line = sight_line(direction, self.size)
         self.foot = foot
-        name, thin = f"{self.root}/body_0/line_of_sight", 0.0007 * self.size
+        name, thin = f"{self.root}/body_0/line_of_sight", 0.0009 * self.size
         now = add_lines(self.server, name, line, SIGHT, 2.0 * thin, position=foot)
         name = f"{self.root}/line_of_sight_at_start"
         before = add_lines(self.server, name, line, FAINT, thin, wxyz=self.start[3:])
