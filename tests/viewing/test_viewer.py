@@ -575,8 +575,14 @@ def test_protections_change_on_the_way_and_reactionless_control_refuses(live):
     for _ in range(20):
         live.advance(1.0)
     assert live.outcome() == "arrived"
-    with pytest.raises(ssm.InputError, match="one of none, yaw"):
-        live.protect("pitch")
+    live.protect("0.6,0,0.8")
+    live._ask()
+    np.testing.assert_allclose(live.law.protection.U_c.T, [[0.6, 0.0, 0.8]])
+    assert abs(live.values[3:6] @ [0.6, 0.0, 0.8]) < 1e-16 < np.linalg.norm(live.values[3:6])
+    assert live.protection.options[-1] == live.protection.value == "0.6,0,0.8"
+    with pytest.raises(ssm.InputError, match="'sideways'"):
+        live.protect("sideways")
+    assert live.chosen == "0.6,0,0.8"
 
 
 def test_live_arrows_are_those_of_the_record(live):

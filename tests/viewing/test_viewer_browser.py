@@ -160,6 +160,14 @@ def test_the_target_is_dragged_by_the_mouse(visit):
         page.get_by_role("option", name="all rotation").click()
         until(page, lambda: live.chosen == "all rotation", "the protection")
         until(page, lambda: "all rotation" in page.content(), "the page's answer")
+        axes = page.get_by_role("textbox").first
+        for written, told in (("0.6,0", "it needs"), ("0.6,0,0.8", None)):
+            axes.fill(written)
+            until(page, lambda written=written: live.own.value == written, "the axes")
+            page.get_by_role("button", name="protect own axes").click()
+            if told is not None:
+                until(page, lambda told=told: "not protected" in page.content() and told in page.content(), "a refusal")
+        until(page, lambda: live.chosen == "0.6,0,0.8", "the own axes")
         pixels(page, "live")
         assert page.complaints == []
         page.close()

@@ -148,14 +148,29 @@ class Live(Page):
         self._wake.set()
 
     def protect(self, name: str) -> None:
-        """Change the protection, to one of `laws`."""
-        if name not in self.laws:
-            raise InputError(f"protection is '{name}'; here it is one of {', '.join(self.laws)}")
+        """Change the protection.
+
+        Args:
+            name: One of `laws`, or what `Protection.parse` reads, such as "pitch" or "0.6,0,0.8": a law is made of it.
+
+        Raises:
+            InputError: it is neither, or no law can protect it.
+        """
         with self._lock:
+            if name not in self.laws:
+                self.laws[name] = self.case.make_law(Protection.parse(name))
+                self.protection.options = tuple(self.laws)
             self.chosen = name
             self.past.changed = self.clock
         self.protection.value = name  # type: ignore[misc]  # viser's setter stands in a class between
         self._wake.set()
+
+    def _on_own(self, event: viser.GuiEvent[Any]) -> None:
+        try:
+            self.protect(self.own.value.strip())
+        except InputError as error:
+            if event.client is not None:
+                event.client.add_notification("not protected", str(error), color="red")
 
     def restart(self) -> None:
         """Put the spacecraft back where the case starts."""
@@ -210,12 +225,15 @@ class Live(Page):
             '<span style="font-size:0.85em;opacity:0.75">drag the target by its arrows</span></div>'
         )
         self.protection = gui.add_dropdown("protect", tuple(self.laws), initial_value=self.chosen)
+        self.own = gui.add_text("own axes", "0.6,0,0.8", hint="a name, three numbers a rotation, or six a twist")
+        own = gui.add_button("protect own axes", icon=viser.Icon.SHIELD)
         self.speed = gui.add_dropdown("speed", tuple(f"{word} x" for word in PACES), initial_value="5 x")
         back = gui.add_button("back to the start", icon=viser.Icon.REFRESH)
         self.state = gui.add_html(self._state())
         gui.add_html(LEGEND)
         self._add_plots()
         self.protection.on_update(lambda event: self.protect(self.protection.value) if event.client else None)
+        own.on_click(self._on_own)
         self.speed.on_update(lambda _: setattr(self, "pace", float(self.speed.value.split()[0])))
         back.on_click(lambda _: self.restart())
 
