@@ -125,6 +125,20 @@ def summary(
 
 
 @campaign.command()
+def plot(store: StorePath, output: Output = Path("results")) -> None:
+    """Draw what came of it: who arrived, how far off, how far the base turned. Writes a PDF and a PNG.
+
+    Samples that are not there yet are left out, so that a campaign can be looked at while it runs.
+    """
+    from ssm_decouple.studies.store import Store
+    from ssm_decouple.viewing.campaign import campaign_sheet
+    from ssm_decouple.viewing.style import save
+
+    for path in save(campaign_sheet(Store.open(store)), output, store.resolve().stem):
+        typer.echo(path)
+
+
+@campaign.command()
 def rerun(
     store: StorePath,
     sample: Annotated[int, typer.Argument(help="Number of the sample, from 0.")],

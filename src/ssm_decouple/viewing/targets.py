@@ -132,13 +132,13 @@ def sheet(trials: Trials) -> Figure:
     maps[0].set_ylabel("z (m)")
     halves[0].colorbar(colors, ax=list(maps), label="share that arrives", shrink=0.85, pad=0.01, aspect=14)
     left, base, sigma = halves[1].subplots(1, 3)
-    _draw_shares(left, {name: 1e3 * trials.found[name].final_error for name in names}, FLOOR_MM)
+    draw_shares(left, {name: 1e3 * trials.found[name].final_error for name in names}, FLOOR_MM)
     left.axvline(1e3 * trials.arrival_tolerance, color="black", linewidth=0.5, linestyle=":")
     left.set(xlabel="distance left at the end (mm)", ylabel="share of the targets")
-    _draw_shares(sigma, {name: trials.found[name].smallest_singular_value for name in names}, FLOOR_SIGMA)
+    draw_shares(sigma, {name: trials.found[name].smallest_singular_value for name in names}, FLOOR_SIGMA)
     sigma.axvline(trials.laws[names[0]].damping_threshold, color="black", linewidth=0.5, linestyle=":")
     sigma.set(xlabel=r"smallest $\sigma$ of $J_{g,t} N_\mathrm{sub}$ on the way (m)")
-    _draw_rotations(base, trials)
+    _draw_where_all_arrive(base, trials)
     count, robot = len(trials.targets.positions), trials.targets.robot.name
     title = f"{trials.targets.start}, {robot}: {count:,} random reachable targets, {trials.duration:g} s"
     figure.suptitle(title, fontsize=9)
@@ -183,7 +183,7 @@ def _points(shape: Shape) -> Floats:
     return np.vstack([np.roll(ring, i, axis=1) for i in range(3)])
 
 
-def _draw_shares(axes: Axes, values: dict[str, Floats], floor: float) -> None:
+def draw_shares(axes: Axes, values: dict[str, Floats], floor: float) -> None:
     """Draw which share of the motions of each law lies below each value."""
     for name, each in values.items():
         line: dict[str, Any] = LAW_LINES.get(name, {})
@@ -193,22 +193,28 @@ def _draw_shares(axes: Axes, values: dict[str, Floats], floor: float) -> None:
     axes.xaxis.set_minor_locator(NullLocator())
 
 
-def _draw_rotations(axes: Axes, trials: Trials) -> None:
-    """Draw the base's angles, 5th to 95th percentile, where all laws arrive that arrive in one of a hundred."""
+def _draw_where_all_arrive(axes: Axes, trials: Trials) -> None:
+    """Draw the base's angles at the targets that all laws reach which reach one of a hundred."""
     arriving = [name for name in trials.found if trials.arrived(name).mean() >= SELDOM]
     both = np.all([np.ones(len(trials.targets.positions), dtype=bool), *map(trials.arrived, arriving)], axis=0)
-    for i, (j, name) in product(range(3), enumerate(arriving)):
-        values = np.maximum(np.rad2deg(trials.found[name].base_rotation[both, i]), FLOOR_DEG)
+    draw_rotations(axes, {name: trials.found[name].base_rotation[both] for name in arriving})
+    told = f"{int(both.sum()):,} targets that these laws reach" if arriving else "no law arrives"
+    axes.set_xlabel(f"base rotation, peak to peak (deg)\n{told}")
+
+
+def draw_rotations(axes: Axes, turned: dict[str, Floats]) -> None:
+    """Draw roll, pitch and yaw (m, 3), rad, of each law's motions: 5th to 95th percentile, quartiles, median."""
+    for i, (j, (name, angles)) in product(range(3), enumerate(turned.items())):
+        values = np.maximum(np.rad2deg(angles[:, i]), FLOOR_DEG)
         if len(values):
             low, first, middle, third, high = np.percentile(values, [5, 25, 50, 75, 95])
-            place = -i - 0.17 * (j - 0.5 * (len(arriving) - 1))
+            place = -i - 0.17 * (j - 0.5 * (len(turned) - 1))
             color = LAW_LINES.get(name, {}).get("color")
             axes.plot([low, high], [place, place], color=color, linewidth=0.8)
             axes.plot([first, third], [place, place], color=color, linewidth=3.0, solid_capstyle="butt")
             edge = color if middle <= FLOOR_DEG else "black"
             axes.plot([middle], [place], color=edge, marker="|", markersize=5, markeredgewidth=0.9, clip_on=False)
-    told = f"{int(both.sum()):,} targets that these laws reach" if arriving else "no law arrives"
-    axes.set(xscale="log", xlabel=f"base rotation, peak to peak (deg)\n{told}", xlim=(0.7 * FLOOR_DEG, 30.0))
+    axes.set(xscale="log", xlim=(0.7 * FLOOR_DEG, 30.0))
     axes.set_xticks(*DEGREES)
     axes.xaxis.set_minor_locator(NullLocator())
     axes.set_yticks([0, -1, -2], list(AXIS_COLORS))
@@ -223,7 +229,7 @@ def distances(studies: Sequence[Trials]) -> Figure:
     figure = Figure(figsize=(PAGE, 1.9 * rows + 0.5))
     grid = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for axes, trials in zip(grid.flat, studies, strict=False):
-        _draw_shares(axes, {name: 1e3 * trials.found[name].final_error for name in trials.found}, FLOOR_MM)
+        draw_shares(axes, {name: 1e3 * trials.found[name].final_error for name in trials.found}, FLOOR_MM)
         axes.axvline(1e3 * trials.arrival_tolerance, color="black", linewidth=0.5, linestyle=":")
         shares = " / ".join(f"{100 * trials.arrived(name).mean():.1f}" for name in trials.found)
         axes.set(title=f"{trials.targets.start}\n{shares} % arrive", xlim=(FLOOR_MM, 6e3))
