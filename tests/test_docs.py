@@ -5,11 +5,14 @@ from __future__ import annotations
 import importlib
 import inspect
 import re
+import shlex
 from pathlib import Path
 
 import pytest
+import typer
 
 import ssm_decouple as ssm
+from ssm_decouple.cli import app
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
@@ -84,3 +87,32 @@ def test_the_readme_tells_what_the_reactionless_page_found():
     for law in ("selective", "reactionless"):
         share, told = found[law]
         assert re.search(rf"{share} % \((95 % interval )?{told}\)", claim[0]), law
+
+
+def helps(command):
+    """Return the help texts of a command and of all below it."""
+    below = getattr(command, "commands", {}).values()
+    return [command.help or "", *(text for each in below for text in helps(each))]
+
+
+def written_commands():
+    """Return every command line in the documents and in the help, without its comment."""
+    lines = []
+    for path in (ROOT / "README.md", ROOT / "CONTRIBUTING.md", *PAGES):
+        lines += re.findall(r"^(?: {4}|\$ |)(ssm-decouple .*)$", path.read_text(encoding="utf-8"), re.MULTILINE)
+    for text in helps(typer.main.get_command(app)):
+        examples = re.findall(r"Examples?: (.*?)(?:\n\n|$)", text, re.DOTALL)
+        lines += [part for part in " ".join(examples).split(";") if part.split()[:1] == ["ssm-decouple"]]
+    return sorted({" ".join(line.split("#")[0].split()) for line in lines})
+
+
+@pytest.mark.parametrize("line", written_commands())
+def test_every_command_that_is_shown_is_one(line):
+    """Its words, options and what they need are those of the command, which is not run."""
+    program, *words = shlex.split(line)
+    command, context = typer.main.get_command(app), None
+    while True:
+        context = command.make_context(program, words, parent=context)
+        if not hasattr(command, "resolve_command"):
+            break
+        program, command, words = command.resolve_command(context, [*context._protected_args, *context.args])
