@@ -36,6 +36,7 @@ THIN = 0.06  # a box whose thinnest edge is below this share of the next is a pa
 CELL = 0.8  # m
 CELL_LINE = 0.012  # m
 LONGEST = 5.0 / 16.0  # of the size of the scene: the arrow of the largest base rate
+SLIM = 0.05  # of the size of the scene: an arrow that is shorter is thinner too
 HEAD = 0.15  # of a rate's arrow, of its length
 _CORNERS = np.array([[1, 1], [-1, 1], [-1, -1], [1, -1]]) / np.sqrt(2.0)  # of a rod, of its radius
 _SIDES = np.array([[i, (i + 1) % 4, 4 + (i + 1) % 4, i, 4 + (i + 1) % 4, 4 + i] for i in range(4)]).reshape(8, 3)
@@ -214,7 +215,8 @@ class Arrows:
             handle.visible = bool(wanted and length > SHORTEST)
             if handle.visible:
                 start = now.base + way_out(self.bus, now.attitude, vector / length)
-                handle.position, handle.wxyz, handle.scale = start, from_z_to(vector), (1.0, 1.0, length)
+                thick = min(1.0, length / (SLIM * self.size))
+                handle.position, handle.wxyz, handle.scale = start, from_z_to(vector), (thick, thick, length)
 
     def _add(self, name: str, points: Floats, color: Rgb, thick: float, head: float) -> Any:
         return self.server.scene.add_arrows(
