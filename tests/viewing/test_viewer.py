@@ -374,6 +374,17 @@ def test_the_clock_plays_pauses_and_ends(motions):
         assert player.time == 12.0
 
 
+def test_a_motion_of_one_sample_is_shown(motions, tmp_path):
+    """What an interrupted run may leave."""
+    first = motions["selective"].isel(time=slice(0, 1))
+    with alone(ssm.view({"first": first, "whole": motions["none"]}, port=0, playing=False)) as player:
+        assert [actor.trail is None for actor in player.stage.actors] == [True, False]
+    with alone(ssm.view(first, port=0, playing=False)) as player:
+        player.seek(5.0)
+        assert (player.time, player.slider.max) == (0.0, 1e-3)
+    assert export.write_html(scenes_of(first), tmp_path / "first.html").stat().st_size > 1e5
+
+
 def test_riding_and_what_is_shown_are_switched_on_the_page(flexible):
     with alone(ssm.view(flexible, port=0, playing=False)) as player:
         actor = player.stage.actors[0]

@@ -18,6 +18,7 @@ from ssm_decouple.viewing.viewer.shapes import LEGEND
 from ssm_decouple.viewing.viewer.stage import Shown, Stage
 
 TEXTS = 6  # a second: numbers and cursors, which no eye follows faster
+SHORT = 1e-3  # s: a slider has some length, also where a motion has one sample
 REST = 1.5  # s: at the end, before the motion begins again
 SPEEDS = ("0.5", "1", "2", "5", "10", "20", "50")
 INERTIAL, BASE = "inertial space", "the base"
@@ -67,7 +68,7 @@ class Player(Page):
         gui.set_panel_label("ssm-decouple")
         gui.add_html(f'<div style="padding:0.5em 0.9em 0 0.9em"><b>{escape("; ".join(sorted(titles)))}</b></div>')
         self.play_button = gui.add_button("", icon=viser.Icon.PLAYER_PAUSE)
-        self.slider = gui.add_slider("time (s)", 0.0, self.end, self.end / 1500, 0.0)
+        self.slider = gui.add_slider("time (s)", 0.0, max(self.end, SHORT), max(self.end, SHORT) / 1500, 0.0)
         self.speed = gui.add_dropdown("speed", tuple(f"{word} x" for word in SPEEDS), initial_value="10 x")
         self.repeat = gui.add_checkbox("repeat", True)
         self.view = gui.add_dropdown("seen from", (INERTIAL, BASE), initial_value=INERTIAL)

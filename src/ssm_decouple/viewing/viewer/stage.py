@@ -157,6 +157,9 @@ class Actor:
     def _add_trail(self) -> None:
         """Add the path of the end-effector, and over it what has been of it, which grows from time to time."""
         path, size = self.scene.motion.end_effector_position.values, self.size
+        self.trail: Trail | None = None
+        if len(path) < 2:  # what an interrupted motion may leave
+            return
         kept = simplified(path, COARSE * size)
         add_lines(self.server, f"{self.root}/path", joined(path[kept]), FAINT, 0.0009 * size)
         pieces = np.linspace(0, len(path) - 1, min(PIECES, len(path) - 1) + 1).astype(int)
@@ -188,10 +191,11 @@ class Actor:
         if self.target.visible:
             self.target.position = frame.target
         now = self.scene.time[frame.sample]
-        done = int(np.searchsorted(self.times, now, side="right")) if shown.path else 0
-        if done != self.done:
-            self.trail.draw(self.grown[:done])
-            self.done = done
+        if self.trail is not None:
+            done = int(np.searchsorted(self.times, now, side="right")) if shown.path else 0
+            if done != self.done:
+                self.trail.draw(self.grown[:done])
+                self.done = done
         if self.sight:
             current, before = self.sight
             current.visible = before.visible = shown.sight
