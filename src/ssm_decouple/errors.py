@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -50,28 +53,34 @@ def as_triple(name: str, value: ArrayLike, axes: str = "") -> NDArray[np.float64
     return vector
 
 
-def as_positive(name: str, value: float) -> float:
+def as_number(name: str, value: float, needs: str = "it needs one finite number", above: float = -np.inf) -> float:
+    """Return a number that has to be finite and above another one.
+
+    Raises:
+        InputError: it is not; the message calls it `name` and ends with `needs`.
+    """
+    number = as_floats(name, value)
+    if number.shape != () or not above < number < np.inf:
+        raise InputError(f"{name} is {value}; {needs}")
+    return float(number)
+
+
+def as_positive(name: str, value: float, needs: str = "it must be a positive number") -> float:
     """Return a number that has to be finite and above zero.
 
     Raises:
-        InputError: it is not; the message calls it `name`.
+        InputError: it is not; the message calls it `name` and ends with `needs`.
     """
-    number = as_floats(name, value)
-    if number.shape != () or not (np.isfinite(number) and number > 0):
-        raise InputError(f"{name} is {value!r}; it must be a positive number")
-    return float(number)
+    return as_number(name, value, needs, 0.0)
 
 
-def as_not_negative(name: str, value: float) -> float:
+def as_not_negative(name: str, value: float, needs: str = "it must be zero or a positive number") -> float:
     """Return a number that has to be finite and not below zero.
 
     Raises:
-        InputError: it is not; the message calls it `name`.
+        InputError: it is not; the message calls it `name` and ends with `needs`.
     """
-    number = as_floats(name, value)
-    if number.shape != () or not (np.isfinite(number) and number >= 0):
-        raise InputError(f"{name} is {value!r}; it must be zero or a positive number")
-    return float(number)
+    return as_number(name, value, needs, -5e-324)  # the number before zero
 
 
 def as_seed(name: str, value: int) -> int:
@@ -83,3 +92,11 @@ def as_seed(name: str, value: int) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise InputError(f"{name} is {value!r}; it must be a whole number from 0")
     return value
+
+
+def unknown(kind: str, word: str, known: Sequence[str]) -> str:
+    """Say that a word is not known, and which known one is nearest."""
+    nearest = difflib.get_close_matches(word, known, 1, 0.5)
+    return f"unknown {kind} '{word}'; " + (
+        f"did you mean '{nearest[0]}'?" if nearest else f"known: {', '.join(known) or 'none'}"
+    )

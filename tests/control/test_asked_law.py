@@ -316,7 +316,7 @@ def test_nothing_of_what_was_asked_stays_behind(ets_vii):
         ({"protected_rate": "x"}, "protected_rate is 'x'; it needs real numbers"),
         ({"pace": -0.1}, "pace is -0.1; it is between 0"),
         ({"pace": 1.1}, "pace is 1.1"),
-        ({"pace": np.nan}, "pace is nan; it must be one finite number"),
+        ({"pace": np.nan}, "pace is nan; it needs one finite number"),
         ({"pace": [1.0, 1.0]}, "pace is"),
         ({"pace": "slow"}, "pace is 'slow'; it needs real numbers"),
     ],

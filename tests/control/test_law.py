@@ -403,7 +403,7 @@ def test_a_command_keeps_its_numbers(ets_vii):
     ("options", "says"),
     [
         ({"gain": 0.0}, "gain is 0.0; it must be a positive"),
-        ({"gain": np.nan}, "gain is nan; it must be one finite number"),
+        ({"gain": np.nan}, "gain is nan; it must be a positive number"),
         ({"gain": np.inf}, "gain is inf"),
         ({"gain": "a"}, "gain is 'a'; it needs real numbers"),
         ({"rate_limit": "x"}, "rate_limit is 'x'; it needs real numbers"),

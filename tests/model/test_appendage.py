@@ -450,11 +450,9 @@ def test_wings_that_do_not_fit_the_robot_are_refused(ets_vii):
         ets_vii.with_appendages(wing())
     with pytest.raises(ssm.InputError, match=r"'wing' is no appendage; build it with ssm_decouple.Appendage"):
         ets_vii.with_appendages(["wing"])
-    with pytest.raises(
-        ssm.ModelError, match=r"'ets_vii': a wing heavier than the bus: wing weigh 2550 kg of the 2550 kg"
-    ):
+    with pytest.raises(ssm.ModelError, match="'ets_vii': the appendages wing weigh 2550 kg of the 2550 kg of"):
         ets_vii.with_appendages([wing(mass=2550)])
-    with pytest.raises(ssm.ModelError, match=r"without left, right the root link 'bus' keeps the principal moments -1"):
+    with pytest.raises(ssm.ModelError, match=r"without the appendages left, right .* the principal moments -1"):
         ets_vii.with_appendages(pair(mass=400))
     with pytest.raises(ssm.InputError, match="'left' has 1 segments and so as many modes, not 2"):
         ets_vii.with_appendages(pair()).modes(2)

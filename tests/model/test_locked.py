@@ -128,9 +128,9 @@ def test_a_robot_that_has_warned_warns_no_more(ets_vii):
 @pytest.mark.parametrize(
     ("joints", "message"),
     [
-        ({"joint2": 0.1}, r"robot 'ets_vii': there is no joint 'joint2' to lock; did you mean 'joint_2'\?"),
-        ({"knee": 0.1}, "there is no joint 'knee' to lock; it has joint_1, joint_2"),
-        ({"end_effector_mount": 0.1}, "there is no joint 'end_effector_mount' to lock"),
+        ({"joint2": 0.1}, r"robot 'ets_vii': unknown joint 'joint2'; did you mean 'joint_2'\?"),
+        ({"knee": 0.1}, "unknown joint 'knee'; known: joint_1, joint_2"),
+        ({"end_effector_mount": 0.1}, "unknown joint 'end_effector_mount'"),
         ({"joint_2": np.nan}, "position of joint 'joint_2' is nan; it needs one finite number"),
         ({"joint_2": np.inf}, "position of joint 'joint_2' is inf"),
         ({"joint_2": [0.1, 0.2]}, r"position of joint 'joint_2' is \[0.1, 0.2\]; it needs one finite number"),

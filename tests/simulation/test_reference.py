@@ -1,4 +1,4 @@
-"""Moving targets against differences, conservation, a closed form and Euler's equations integrated another way."""
+"""Moving targets against differences, conservation, closed forms and Euler's equations in elliptic functions."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.integrate import solve_ivp
+from scipy.special import ellipj
 
 import ssm_decouple as ssm
 
@@ -80,21 +80,25 @@ def test_an_axisymmetric_body_in_closed_form(moments):
         np.testing.assert_allclose(target.pose(time).rotation, expected, atol=1e-11)
 
 
-def test_euler_s_equations_integrated_in_body_axes():
-    target, R0 = ssm.TumblingTarget(**TUMBLE), TUMBLE["attitude"]
-    start, times = R0.T @ TUMBLE["angular_velocity"], [10.0, 100.0, 400.0]
-    euler = solve_ivp(
-        lambda _, w: np.linalg.solve(INERTIA, np.cross(INERTIA @ w, w)),
-        (0, 400),
-        start,
-        "LSODA",
-        times,
-        rtol=1e-11,
-        atol=1e-13,
-    )
-    for time, body in zip(times, euler.y.T, strict=True):
-        R = target.pose(time).rotation
-        np.testing.assert_allclose(R.T @ target.twist(time)[3:], body, atol=1e-9)
+@pytest.mark.parametrize(("about_long", "about_short"), [(0.01, 0.05), (0.05, 0.01)])
+def test_euler_s_equations_solved_by_jacobi_s_functions(about_long, about_short):
+    """A body of three different moments: its rates along the principal axes are cn, sn and dn, or dn, sn and cn."""
+    I1, I2, I3 = np.linalg.eigvalsh(INERTIA)
+    axes = np.linalg.eigh(INERTIA)[1]
+    axes *= np.linalg.det(axes)
+    turned = I1 * (I2 - I1) * about_long**2 > I3 * (I3 - I2) * about_short**2
+    if turned:
+        I1, I3, about_long, about_short, axes = I3, I1, about_short, about_long, axes[:, ::-1] * [1, -1, 1]
+    pace = about_short * np.sqrt((I3 - I1) * (I3 - I2) / (I1 * I2)) * (-1 if turned else 1)
+    middle = (I3 - I1) * about_long * about_short / (I2 * pace)
+    m = (I2 - I1) * about_long * middle / (I3 * pace * about_short)
+    R0 = TUMBLE["attitude"]
+    spin = R0 @ axes @ [about_long, 0, about_short]
+    target = ssm.TumblingTarget(**TUMBLE | {"angular_velocity": spin})
+    for time in (10.0, 100.0, 1000.0, 5000.0):
+        sn, cn, dn, _ = ellipj(pace * time, m)
+        body = axes @ [about_long * cn, middle * sn, about_short * dn]
+        np.testing.assert_allclose(target.pose(time).rotation.T @ target.twist(time)[3:], body, atol=1e-12)
 
 
 def test_velocities_are_derivatives():

@@ -166,9 +166,9 @@ class Engine(ABC):
         out = np.empty((len(joints), law.size))
         self._command(law, joints, poses, wanted, out)
         commands = Commands(out, self.robot.n_joints, law.protection.k)
-        turned = _rotations(poses)
-        commands.end_effector_position[:] = _turned(turned, commands.end_effector_position) + poses[:, :3]
-        commands.end_effector_error[:] = _turned(turned, commands.end_effector_error)
+        tools = commands.end_effector_position.copy()
+        rows.place_points(poses, tools)
+        commands.end_effector_position[:], commands.end_effector_error[:] = tools, wanted - tools
         return commands
 
     def motions(
@@ -195,7 +195,7 @@ class Engine(ABC):
         Raises:
             InputError: another law, shapes that do not fit, or times that make no sense.
         """
-        times = sample_times(as_positive("duration", duration), as_positive("dt", dt))
+        times = sample_times(duration, dt)
         tolerance = as_positive("arrival_tolerance", arrival_tolerance)
         joints, poses, wanted = self._starts(law, starts, targets)
         N = len(joints)
@@ -257,14 +257,18 @@ class Engine(ABC):
             )
         N = len(given) if len(wanted) == 1 else len(wanted)
         joints, poses = (
-            (given, np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(given), 1))) if given.shape[1] == n else (self._split(given))
+            (given, np.tile([0.0, 0, 0, 0, 0, 0, 1], (len(given), 1))) if given.shape[1] == n else self.split(given)
         )
         spread = [np.broadcast_to(part, (N, part.shape[1])).copy() for part in (joints, poses, wanted)]
         return spread[0], spread[1], spread[2]
 
-    def _split(self, configurations: Floats) -> tuple[Floats, Floats]:
-        """Return joint positions and base poses of configurations."""
-        poses, joints = configurations[:, :7], configurations[:, self._places]
+    def split(self, configurations: Floats) -> tuple[Floats, Floats]:
+        """Return joint positions (N, n), rad or m, and base poses (N, 7) of configurations (N, nq); copies.
+
+        Raises:
+            InputError: a base quaternion that is not of unit length.
+        """
+        poses, joints = configurations[:, :7].copy(), configurations[:, self._places]
         off = np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1.0) > 1e-6
         if off.any():
             row = int(np.argmax(off))
@@ -334,18 +338,3 @@ def _judge(
         if np.isfinite(error[-1]):
             outcome = judge(times, error, tolerance, time_constant)
             outcomes[i], ends[i] = outcome.name, outcome.time
-
-
-def _rotations(poses: Floats) -> Floats:
-    """Return the rotations (N, 3, 3) of poses (N, 7) with unit quaternions."""
-    x, y, z, w = poses[:, 3:].T
-    turned = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.moveaxis(np.array(turned), 2, 0)
-
-
-def _turned(rotations: Floats, vectors: Floats) -> Floats:
-    return np.einsum("nij,nj->ni", rotations, vectors)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_decouple.control import kernel
+from ssm_decouple.control.law import CommandedMotion
 
 Floats = NDArray[np.float64]
 
@@ -72,7 +73,7 @@ class Matrices:
 
 
 @dataclass(frozen=True)
-class Commands:
+class Commands(CommandedMotion):
     """What the law commands at many configurations, a row each, as `Command` has it for one.
 
     Attributes:
@@ -86,31 +87,6 @@ class Commands:
     k: int
 
     @property
-    def velocity(self) -> Floats:
-        """Pinocchio velocities v (N, 6 + n): base twists in base axes, then joint rates."""
-        return self.values[:, : 6 + self.n]
-
-    @property
-    def joint_rates(self) -> Floats:
-        """Commanded joint rates (N, n), rad/s or m/s (paper, eq. 17)."""
-        return self.values[:, 6 : 6 + self.n]
-
-    @property
-    def base_twist(self) -> Floats:
-        """Base twists (N, 6) that the rates cause: [linear; angular], m/s and rad/s, base axes."""
-        return self.values[:, :6]
-
-    @property
-    def protected_rate(self) -> Floats:
-        """J_sub q_dot (N, k), rad/s (paper, eq. 6): rounding."""
-        return self._results(kernel.PROTECTED_RATE, self.k)
-
-    @property
-    def end_effector_position(self) -> Floats:
-        """End-effector positions (N, 3), m, inertial axes."""
-        return self._results(kernel.POSITION, 3)
-
-    @property
     def end_effector_error(self) -> Floats:
         """Targets minus end-effector positions (N, 3), m, inertial axes."""
         return self._results(kernel.ERRORS, 3)
@@ -118,21 +94,17 @@ class Commands:
     @property
     def smallest_singular_value(self) -> Floats:
         """Smallest singular value of J_gt N_sub (N,), m, in the law's joint weights."""
-        return self._results(kernel.ERRORS + 3, 1)[:, 0]
+        return self._results(kernel.ERRORS + 3)[:, 0]
 
     @property
     def damping(self) -> Floats:
         """The regularising scalar rho (N,), m2 (paper, eq. 11); 0 away from singularities."""
-        return self._results(kernel.ERRORS + 4, 1)[:, 0]
+        return self._results(kernel.ERRORS + 4)[:, 0]
 
     @property
     def rate_scale(self) -> Floats:
         """Factor in (0, 1] that brought the whole rate vector inside the limits (N,)."""
-        return self._results(kernel.RATE_SCALE, 1)[:, 0]
-
-    def _results(self, index: int, count: int) -> Floats:
-        start = 6 + self.n + index
-        return self.values[:, start : start + count]
+        return self._results(kernel.RATE_SCALE)[:, 0]
 
 
 @dataclass(frozen=True)

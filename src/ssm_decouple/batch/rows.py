@@ -27,14 +27,10 @@ RECORD_SIZE = 10
 
 
 @compiled
-def turn_back(pose: Floats, point: Floats, out: Floats) -> None:
-    """Fill a point (3,), given in inertial axes and from their origin, as seen from a pose (7,): position, x y z w."""
-    x, y, z, w = -pose[3], -pose[4], -pose[5], pose[6]
-    a, b, c = point[0] - pose[0], point[1] - pose[1], point[2] - pose[2]
+def turned(x: float, y: float, z: float, w: float, a: float, b: float, c: float) -> tuple[float, float, float]:
+    """Return a vector (a, b, c) turned by a unit quaternion."""
     u, v, t = 2.0 * (y * c - z * b), 2.0 * (z * a - x * c), 2.0 * (x * b - y * a)
-    out[0] = a + w * u + y * t - z * v
-    out[1] = b + w * v + z * u - x * t
-    out[2] = c + w * t + x * v - y * u
+    return a + w * u + y * t - z * v, b + w * v + z * u - x * t, c + w * t + x * v - y * u
 
 
 @compiled
@@ -60,10 +56,8 @@ def move_pose(pose: Floats, twist: Floats, time: float) -> None:
     my = vy + first * ay + second * (wy * along - vy * square)
     mz = vz + first * az + second * (wz * along - vz * square)
     x, y, z, w = pose[3], pose[4], pose[5], pose[6]
-    u, v, t = 2.0 * (y * mz - z * my), 2.0 * (z * mx - x * mz), 2.0 * (x * my - y * mx)
-    pose[0] += mx + w * u + y * t - z * v
-    pose[1] += my + w * v + z * u - x * t
-    pose[2] += mz + w * t + x * v - y * u
+    mx, my, mz = turned(x, y, z, w, mx, my, mz)
+    pose[0], pose[1], pose[2] = pose[0] + mx, pose[1] + my, pose[2] + mz
     s, c = 0.5 * sinc, np.cos(half)
     a, b, d = s * wx, s * wy, s * wz
     x, y, z, w = (
@@ -93,7 +87,25 @@ def keep_attitude(pose: Floats, record: Floats) -> None:
 def see_targets(poses: Floats, targets: Floats, seen: Floats) -> None:
     """Fill the targets (rows, 3), inertial axes, as seen from the base poses (rows, 7)."""
     for row in range(poses.shape[0]):
-        turn_back(poses[row], targets[row], seen[row])
+        pose, target = poses[row], targets[row]
+        a, b, c = target[0] - pose[0], target[1] - pose[1], target[2] - pose[2]
+        seen[row, 0], seen[row, 1], seen[row, 2] = turned(-pose[3], -pose[4], -pose[5], pose[6], a, b, c)
+
+
+@unlocked
+def place_points(poses: Floats, points: Floats) -> None:
+    """Bring points (rows, 3) from the axes of poses (rows, 7), position and x y z w, to inertial axes, in place."""
+    for row in range(poses.shape[0]):
+        pose, point = poses[row], points[row]
+        a, b, c = turned(pose[3], pose[4], pose[5], pose[6], point[0], point[1], point[2])
+        point[0], point[1], point[2] = pose[0] + a, pose[1] + b, pose[2] + c
+
+
+@unlocked
+def move_poses(poses: Floats, twists: Floats) -> None:
+    """Move poses (rows, 7) by twists (rows, 6) in their own axes that are held for a second."""
+    for row in range(poses.shape[0]):
+        move_pose(poses[row], twists[row], 1.0)
 
 
 @unlocked

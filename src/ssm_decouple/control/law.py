@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.task import Layout, PositionTask, Task, checked_tasks
-from ssm_decouple.errors import DecoupleWarning, InputError, as_floats
+from ssm_decouple.errors import DecoupleWarning, InputError, as_floats, as_not_negative, as_number, as_positive
 from ssm_decouple.model.robot import Robot, per_joint
 from ssm_decouple.momentum.flow import munthe_kaas
 from ssm_decouple.momentum.protection import Protection
@@ -40,44 +40,37 @@ PASSES = 12  # at most; away from singularities each gains a factor of about sam
 CONVERGED = 1e-13  # relative change of the rates from pass to pass
 
 
-class Command:
-    """What the law commands at one configuration, and what follows from it.
+class CommandedMotion:
+    """What one command and the commands of a batch, a row each, have in common: views of their numbers."""
 
-    The numbers stand in one array, `values`, and the attributes are views of it. What belongs to a task comes in the
-    order in which the tasks were given to the law, what belongs to a level in the order of the levels.
-    """
-
-    __slots__ = ("k", "layout", "n", "values")
-
-    def __init__(self, values: Floats, n: int, k: int, layout: Layout) -> None:
-        self.values = values
-        self.n = n
-        self.k = k
-        self.layout = layout
+    __slots__ = ("k", "n", "values")
+    values: Floats
+    n: int
+    k: int
 
     @property
     def velocity(self) -> Floats:
-        """Pinocchio velocity v (6 + n,): base twist in base axes, then joint rates."""
-        return self.values[: 6 + self.n]
+        """Pinocchio velocity v (.., 6 + n): base twist in base axes, then joint rates."""
+        return self.values[..., : 6 + self.n]
 
     @property
     def joint_rates(self) -> Floats:
-        """Commanded joint rates q_dot (n,), rad/s or m/s (paper, eq. 17)."""
-        return self.values[6 : 6 + self.n]
+        """Commanded joint rates q_dot (.., n), rad/s or m/s (paper, eq. 17)."""
+        return self.values[..., 6 : 6 + self.n]
 
     @property
     def base_twist(self) -> Floats:
-        """Base twist (6,) that the rates cause: [linear; angular], m/s and rad/s, base axes."""
-        return self.values[:6]
+        """Base twist (.., 6) that the rates cause: [linear; angular], m/s and rad/s, base axes."""
+        return self.values[..., :6]
 
     @property
     def base_angular_velocity_body(self) -> Floats:
-        """Base angular velocity (3,), rad/s, base axes: J_rc q_dot (paper, eq. 4)."""
-        return self.values[3:6]
+        """Base angular velocity (.., 3), rad/s, base axes: J_rc q_dot (paper, eq. 4)."""
+        return self.values[..., 3:6]
 
     @property
     def protected_rate(self) -> Floats:
-        """Constrained disturbance angular velocity w_sub = J_sub q_dot (k,), rad/s (paper, eq. 6): rounding.
+        """Constrained disturbance angular velocity w_sub = J_sub q_dot (.., k), rad/s (paper, eq. 6): rounding.
 
         Of a law with hold nodes, its mean over the hold. Where a rate was asked for it is that rate, or what of it the
         arm and its rate limits can give. With directions of the whole twist it mixes m/s and rad/s.
@@ -86,8 +79,28 @@ class Command:
 
     @property
     def end_effector_position(self) -> Floats:
-        """End-effector position (3,), m, inertial axes."""
+        """End-effector position (.., 3), m, inertial axes."""
         return self._results(kernel.POSITION, 3)
+
+    def _results(self, index: int, count: int = 1) -> Floats:
+        start = 6 + self.n + index
+        return self.values[..., start : start + count]
+
+
+class Command(CommandedMotion):
+    """What the law commands at one configuration, and what follows from it.
+
+    The numbers stand in one array, `values`, and the attributes are views of it. What belongs to a task comes in the
+    order in which the tasks were given to the law, what belongs to a level in the order of the levels.
+    """
+
+    __slots__ = ("layout",)
+
+    def __init__(self, values: Floats, n: int, k: int, layout: Layout) -> None:
+        self.values = values
+        self.n = n
+        self.k = k
+        self.layout = layout
 
     @property
     def end_effector_error(self) -> Floats:
@@ -167,10 +180,6 @@ class Command:
     def rank(self) -> int:
         """Rank of J_sub: how many joint freedoms the protection takes."""
         return int(self._results(kernel.RANK)[0])
-
-    def _results(self, index: int, count: int = 1) -> Floats:
-        start = 6 + self.n + index
-        return self.values[start : start + count]
 
     def _told_errors(self) -> str:
         if self.layout.plain:
@@ -295,8 +304,6 @@ class SelectiveLaw:
             raise InputError(f"'{robot.name}' has no joints to command; put an arm on it with compose(..)")
         if not isinstance(protection, Protection):
             raise InputError(f"protection is {protection!r}; give a Protection, such as Protection('yaw')")
-        if not (_finite("damping", damping) >= 0):
-            raise InputError(f"damping is {damping}; it must be zero or a positive number")
         if not (isinstance(hold_nodes, int) and hold_nodes in GAUSS):
             raise InputError(f"hold_nodes is {hold_nodes}; it is 0 (at the sample), 1, 2 or 3")
         if sample_time is None and (hold_nodes or acceleration_limit is not None or limits is not None):
@@ -305,10 +312,10 @@ class SelectiveLaw:
             )
         self.robot = robot
         self.protection = protection
-        self.gain = _positive("gain", gain)
-        self.damping = float(damping)
-        self.damping_threshold = _positive("damping_threshold", damping_threshold)
-        self.sample_time = None if sample_time is None else _positive("sample_time", sample_time)
+        self.gain = as_positive("gain", gain)
+        self.damping = as_not_negative("damping", damping)
+        self.damping_threshold = as_positive("damping_threshold", damping_threshold)
+        self.sample_time = None if sample_time is None else as_positive("sample_time", sample_time)
         self.hold_nodes = hold_nodes
         self.rate_limits: Floats = per_joint(
             robot, "rate_limit", robot.rate_limits if rate_limit is None else rate_limit
@@ -823,7 +830,7 @@ class SelectiveLaw:
     def _asked(self, protected_rate: ArrayLike | None, pace: float) -> Floats:
         """Return pace and protected rate as they stand in the kernel's parameters."""
         asked = np.zeros(kernel.MOMENTUM - kernel.PACE)
-        asked[0] = _finite("pace", pace)
+        asked[0] = as_number("pace", pace)
         if not 0.0 <= asked[0] <= 1.0:
             raise InputError(f"pace is {pace}; it is between 0 (at rest) and 1 (full)")
         if protected_rate is not None:
@@ -896,20 +903,6 @@ def _placements(data: pin.Data, joints: int) -> Floats:
         if addresses != [start + i * width, start + i * width + 9 * first.itemsize]:
             raise RuntimeError("this Pinocchio does not keep its placements one after the other")
     return np.lib.stride_tricks.as_strided(first, (joints, 12), (width, first.itemsize))
-
-
-def _finite(name: str, value: float) -> float:
-    number = as_floats(name, value)
-    if number.shape != () or not np.isfinite(number):
-        raise InputError(f"{name} is {value}; it must be one finite number")
-    return float(number)
-
-
-def _positive(name: str, value: float) -> float:
-    number = _finite(name, value)
-    if not number > 0:
-        raise InputError(f"{name} is {value}; it must be a positive number")
-    return number
 
 
 def _vector(name: str, value: ArrayLike) -> Floats:

@@ -16,7 +16,7 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.errors import InputError, as_floats
+from ssm_decouple.errors import InputError, as_floats, as_positive
 from ssm_decouple.model.robot import Robot
 
 Floats = NDArray[np.float64]
@@ -55,9 +55,7 @@ class Task(ABC):
 
     def __post_init__(self) -> None:
         for name, value in (("gain", self.gain), ("weight", self.weight)):
-            number = as_floats(name, 1.0 if value is None else value)
-            if number.shape != () or not (np.isfinite(number) and number > 0):
-                raise InputError(f"{self.word} task: {name} is {value!r}; it must be a positive number")
+            as_positive(f"{self.word} task: {name}", 1.0 if value is None else value)
         if isinstance(self.level, bool) or not isinstance(self.level, int) or self.level < 1:
             raise InputError(f"{self.word} task: level is {self.level!r}; levels are 1 (first), 2, ..")
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,8 +12,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_decouple.errors import InputError, ModelError
-from ssm_decouple.model.urdf import Body, Finding, inspect_urdf, read_body, refuse_twins, root_link, triple, write_body
+from ssm_decouple.errors import InputError
+from ssm_decouple.model.urdf import (
+    Body,
+    Finding,
+    inspect_urdf,
+    parted_urdf,
+    refuse_twins,
+    remaining_body,
+    root_link,
+    triple,
+    write_body,
+)
 
 Floats = NDArray[np.float64]
 
@@ -310,28 +319,7 @@ def remaining_bus(root: ET.Element, appendages: Sequence[Appendage]) -> Body:
     Raises:
         ModelError: they weigh as much as the root link or more, or leave an inertia that no body can have.
     """
-    name, bus = root_link(root), _root_body(root)
-    weight = sum(appendage.mass for appendage in appendages)
-    whose = ", ".join(appendage.name for appendage in appendages)
-    if not weight < bus.mass:
-        raise ModelError(
-            f"a wing heavier than the bus: {whose} weigh {weight:g} kg of the {bus.mass:g} kg of the root link "
-            f"'{name}', whose inertia has to hold them; make them lighter or the root link heavier"
-        )
-    remaining = bus.without(appendage.body for appendage in appendages)
-    moments = np.linalg.eigvalsh(remaining.inertia)
-    if not moments[0] > 0:
-        listed = ", ".join(f"{moment:.5g}" for moment in moments)
-        raise ModelError(
-            f"without {whose} the root link '{name}' keeps the principal moments {listed} kg m2, which no body has: "
-            "its inertia has to hold its appendages; make them lighter or shorter, or the root link's inertia larger"
-        )
-    return remaining
-
-
-def _root_body(root: ET.Element) -> Body:
-    name = root_link(root)
-    return read_body(next(link for link in root.findall("link") if link.get("name") == name))
+    return remaining_body(root, "appendage", {appendage.name: appendage.body for appendage in appendages})
 
 
 def flexible_urdf(root: ET.Element, appendages: Sequence[Appendage]) -> ET.Element:
@@ -340,21 +328,8 @@ def flexible_urdf(root: ET.Element, appendages: Sequence[Appendage]) -> ET.Eleme
     Raises:
         ModelError: as `remaining_bus`, or the URDF has a link or joint of the same name.
     """
-    remaining, base = remaining_bus(root, appendages), root_link(root)
-    whole = copy.deepcopy(root)
-    taken = {kind: {element.get("name") for element in whole.findall(kind)} for kind in ("link", "joint")}
-    write_body(next(link for link in whole.findall("link") if link.get("name") == base), remaining)
-    for appendage in appendages:
-        for element in _chain(appendage, base):
-            name = element.get("name")
-            if name in taken[element.tag]:
-                raise ModelError(
-                    f"the robot has a {element.tag} '{name}' already; call appendage '{appendage.name}' something else"
-                )
-            taken[element.tag].add(name)
-            whole.append(element)
-    ET.indent(whole)
-    return whole
+    base = root_link(root)
+    return parted_urdf(root, "appendage", {part.name: (part.body, _chain(part, base)) for part in appendages})
 
 
 def inspect_remaining_bus(root: ET.Element, appendages: Sequence[Appendage]) -> list[Finding]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import difflib
 import math
 import tomllib
 from dataclasses import dataclass
@@ -11,7 +10,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ssm_decouple.errors import InputError, ModelError
+from ssm_decouple.errors import InputError, ModelError, unknown
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.model.urdf import read_urdf
@@ -124,7 +123,7 @@ def describe(source: str | Path) -> Description:
 def _description(content: dict[str, Any], path: Path) -> Description:
     for key in content:
         if key not in _KEYS:
-            raise ModelError(_unknown(key, list(_KEYS)))
+            raise ModelError(unknown("key", key, _KEYS))
     for key in ("urdf", "end_effector"):
         if key in content and not isinstance(content[key], str):
             raise ModelError(f"{key} is {content[key]!r}; it must be a text")
@@ -145,7 +144,7 @@ def _appendage(wing: dict[str, Any], count: int) -> Appendage:
     place = f"[[appendage]] {wing.get('name', count)}: "
     for key in wing:
         if key not in _APPENDAGE_KEYS:
-            raise ModelError(place + _unknown(key, list(_APPENDAGE_KEYS)))
+            raise ModelError(place + unknown("key", key, list(_APPENDAGE_KEYS)))
     missing = [key for key, needed in _APPENDAGE_KEYS.items() if needed and key not in wing]
     if missing:
         raise ModelError(f"{place}{missing[0]} is missing")
@@ -154,11 +153,6 @@ def _appendage(wing: dict[str, Any], count: int) -> Appendage:
     if not isinstance(turn, int | float) or isinstance(turn, bool):
         raise ModelError(f"{place}turn_deg is {turn!r}; it must be a number")
     return Appendage(**values, turn=math.radians(turn))
-
-
-def _unknown(word: str, known: list[str]) -> str:
-    nearest = difflib.get_close_matches(word, known, 1, 0.5)
-    return f"unknown key '{word}'; " + (f"did you mean '{nearest[0]}'?" if nearest else f"known: {', '.join(known)}")
 
 
 def example_robot(path: str) -> Path:

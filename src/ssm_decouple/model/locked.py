@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import copy
-import difflib
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pinocchio as pin
 
-from ssm_decouple.errors import InputError, as_floats
+from ssm_decouple.errors import InputError, as_number, unknown
 from ssm_decouple.model.urdf import floats, triple
 
 _OF_A_FIXED_JOINT = ("parent", "child", "origin")
@@ -33,13 +32,9 @@ def locked_urdf(root: ET.Element, positions: Mapping[str, float], known: Sequenc
     joints = {joint.get("name"): joint for joint in whole.findall("joint")}
     for name, position in positions.items():
         if name not in known:
-            near = difflib.get_close_matches(str(name), known, 1, 0.5)
-            mend = f"did you mean '{near[0]}'?" if near else f"it has {', '.join(known) or 'none that moves'}"
-            raise InputError(f"there is no joint '{name}' to lock; {mend}")
-        value = as_floats(f"position of joint '{name}'", position)
-        if value.shape != () or not np.isfinite(value):
-            raise InputError(f"position of joint '{name}' is {position!r}; it needs one finite number, rad or m")
-        _lock(joints[name], float(value))
+            raise InputError(unknown("joint", str(name), known))
+        needs = "it needs one finite number, rad or m"
+        _lock(joints[name], as_number(f"position of joint '{name}'", position, needs))
     ET.indent(whole)
     return whole
 

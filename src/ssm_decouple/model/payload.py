@@ -8,7 +8,7 @@ import xml.etree.ElementTree as ET
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_decouple.errors import InputError, ModelError, as_floats
+from ssm_decouple.errors import InputError, ModelError, as_floats, as_positive
 from ssm_decouple.model.urdf import Body, write_body
 
 Floats = NDArray[np.float64]
@@ -28,12 +28,11 @@ def payload_body(mass: float, centre_of_mass: ArrayLike, inertia: ArrayLike) -> 
         InputError: a mass that is not positive, or numbers of the wrong shape.
         ModelError: an inertia that no body has.
     """
-    weight, centre = as_floats("payload mass", mass), as_floats("payload centre_of_mass", centre_of_mass)
-    if weight.shape != () or not (np.isfinite(weight) and weight > 0):
-        raise InputError(f"payload mass is {mass}; it must be above zero, in kg: with nothing in its hand leave it out")
+    needs = "it must be above zero, in kg: with nothing in its hand leave it out"
+    weight, centre = as_positive("payload mass", mass, needs), as_floats("payload centre_of_mass", centre_of_mass)
     if centre.shape != (3,) or not np.all(np.isfinite(centre)):
         raise InputError(f"payload centre_of_mass is {centre.tolist()}; it needs 3 finite numbers, m, the frame's axes")
-    return Body(float(weight), centre, possible_inertia("payload inertia", inertia))
+    return Body(weight, centre, possible_inertia("payload inertia", inertia))
 
 
 def possible_inertia(name: str, inertia: ArrayLike) -> Floats:

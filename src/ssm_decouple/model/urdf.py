@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import xml.etree.ElementTree as ET
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -296,6 +297,60 @@ def write_body(link: ET.Element, body: Body) -> None:
     tensor = {f"i{'xyz'[i]}{'xyz'[j]}": repr(float(body.inertia[i, j])) for i in range(3) for j in range(i, 3)}
     ET.SubElement(inertial, "inertia", tensor)
     link.insert(0, inertial)
+
+
+def remaining_body(root: ET.Element, kind: str, parts: Mapping[str, Body]) -> Body:
+    """Return what remains of the root link when parts of it, by name and in its axes, are taken out.
+
+    Raises:
+        ModelError: they weigh as much as the root link or more, or leave an inertia that no body can have; the message
+            calls each `kind`.
+    """
+    base = root_link(root)
+    whole, weight, whose = read_body(_link(root, base)), sum(part.mass for part in parts.values()), ", ".join(parts)
+    if not weight < whole.mass:
+        raise ModelError(
+            f"the {kind}s {whose} weigh {weight:g} kg of the {whole.mass:g} kg of the root link '{base}', which has to "
+            "hold them; make them lighter or the root link heavier"
+        )
+    remaining = whole.without(parts.values())
+    moments = np.linalg.eigvalsh(remaining.inertia)
+    if not moments[0] > 0:
+        listed = ", ".join(f"{moment:.5g}" for moment in moments)
+        raise ModelError(
+            f"without the {kind}s {whose} the root link '{base}' keeps the principal moments {listed} kg m2, which no "
+            "body has: its inertia has to hold them; make them smaller, or the root link's inertia larger"
+        )
+    return remaining
+
+
+def parted_urdf(root: ET.Element, kind: str, parts: Mapping[str, tuple[Body, Iterable[ET.Element]]]) -> ET.Element:
+    """Return a URDF with parts as links and joints of their own, taken out of the root link.
+
+    Args:
+        root: The robot.
+        kind: What messages call a part.
+        parts: By name the body, in the axes of the root link, and the links and joints.
+
+    Raises:
+        ModelError: as `remaining_body`, or the URDF has a link or joint of the same name.
+    """
+    whole, taken = copy.deepcopy(root), {(element.tag, element.get("name")) for element in root}
+    remaining = remaining_body(root, kind, {name: body for name, (body, _) in parts.items()})
+    write_body(_link(whole, root_link(whole)), remaining)
+    for part, (_, elements) in parts.items():
+        for element in elements:
+            name = element.get("name")
+            if (element.tag, name) in taken:
+                raise ModelError(f"the robot has a {element.tag} '{name}' already; call {kind} '{part}' something else")
+            taken.add((element.tag, name))
+            whole.append(element)
+    ET.indent(whole)
+    return whole
+
+
+def _link(root: ET.Element, name: str) -> ET.Element:
+    return next(link for link in root.findall("link") if link.get("name") == name)
 
 
 def triple(vector: NDArray[np.float64]) -> str:

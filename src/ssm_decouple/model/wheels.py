@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import copy
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from itertools import combinations
 from typing import Any
@@ -12,8 +11,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_decouple.errors import InputError, ModelError, as_floats
-from ssm_decouple.model.urdf import Body, floats, read_body, refuse_twins, root_link, triple, write_body
+from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_positive
+from ssm_decouple.model.urdf import Body, floats, parted_urdf, refuse_twins, root_link, triple, write_body
 
 Floats = NDArray[np.float64]
 
@@ -56,8 +55,8 @@ class Wheel:
         if not isinstance(self.name, str) or not self.name.strip():
             raise InputError(f"a wheel's name is {self.name!r}; give it a text that is not empty")
         for key, unit in {"spin_inertia": "kg m2", "max_speed": "rad/s", "max_torque": "N m"}.items():
-            self._number(key, above=0.0, mend=f"it must be above zero and finite, in {unit}")
-        self._number("mass", above=-np.finfo(float).tiny, mend="it must be zero or more and finite, in kg")
+            self._set(key, as_positive, f"it must be above zero and finite, in {unit}")
+        self._set("mass", as_not_negative, "it must be zero or more and finite, in kg")
         axis = self._vector("axis")
         length = float(np.linalg.norm(axis))
         if not 1e-9 < length < np.inf:
@@ -68,11 +67,8 @@ class Wheel:
     def _error(self, key: str, mend: str) -> InputError:
         return InputError(f"wheel '{self.name}': {key} is {getattr(self, key)!r}; {mend}")
 
-    def _number(self, key: str, above: float, mend: str) -> None:
-        value = as_floats(f"wheel '{self.name}': {key}", getattr(self, key))
-        if value.shape != () or not above < value < np.inf:
-            raise self._error(key, mend)
-        object.__setattr__(self, key, float(value))
+    def _set(self, key: str, checked: Callable[[str, float, str], float], needs: str) -> None:
+        object.__setattr__(self, key, checked(f"wheel '{self.name}': {key}", getattr(self, key), needs))
 
     def _vector(self, key: str) -> Floats:
         values = as_floats(f"wheel '{self.name}': {key}", getattr(self, key))
@@ -98,20 +94,9 @@ def wheeled_urdf(root: ET.Element, wheels: Iterable[Wheel]) -> ET.Element:
         ModelError: a name that the URDF has, or wheels that leave the root link no possible mass or inertia.
     """
     added = _checked(wheels)
-    whole, base = copy.deepcopy(root), root_link(root)
     _refuse_parallel({**wheel_axes(root), **{wheel.name: np.array(wheel.axis) for wheel in added}})
-    bus = next(link for link in whole.findall("link") if link.get("name") == base)
-    write_body(bus, _remaining(read_body(bus), added, base))
-    for wheel in added:
-        for element in _rotor(wheel, base):
-            if any(other.get("name") == element.get("name") for other in whole.findall(element.tag)):
-                raise ModelError(
-                    f"the robot has a {element.tag} '{element.get('name')}' already; call wheel '{wheel.name}' "
-                    "something else"
-                )
-            whole.append(element)
-    ET.indent(whole)
-    return whole
+    base = root_link(root)
+    return parted_urdf(root, "wheel", {wheel.name: (wheel.body, _rotor(wheel, base)) for wheel in added})
 
 
 def wheel_axes(root: ET.Element) -> dict[str, Floats]:
@@ -143,24 +128,6 @@ def _refuse_parallel(axes: dict[str, Floats]) -> None:
                 f"wheels '{one}' and '{two}' turn about the same axis ({np.rad2deg(angle):.3g} deg apart); make them "
                 "one wheel, or turn one of them"
             )
-
-
-def _remaining(bus: Body, wheels: Sequence[Wheel], name: str) -> Body:
-    whose, weight = ", ".join(wheel.name for wheel in wheels), sum(wheel.mass for wheel in wheels)
-    if not weight < bus.mass:
-        raise ModelError(
-            f"the wheels {whose} weigh {weight:g} kg of the {bus.mass:g} kg of the root link '{name}', which has to "
-            "hold them; make them lighter or the root link heavier"
-        )
-    remaining = bus.without(wheel.body for wheel in wheels)
-    moments = np.linalg.eigvalsh(remaining.inertia)
-    if not moments[0] > 0:
-        listed = ", ".join(f"{moment:.5g}" for moment in moments)
-        raise ModelError(
-            f"without the wheels {whose} the root link '{name}' keeps the principal moments {listed} kg m2, which no "
-            "body has: its inertia has to hold them; make them smaller, or the root link's inertia larger"
-        )
-    return remaining
 
 
 def _rotor(wheel: Wheel, base: str) -> tuple[ET.Element, ET.Element]:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_decouple.errors import InputError, as_floats
+from ssm_decouple.errors import InputError, as_floats, as_positive
 
 if TYPE_CHECKING:
     from ssm_decouple.momentum.coupling import Coupling
@@ -90,9 +90,7 @@ def manipulability(
     allowed = _allowed(coupling, protection)
     if characteristic_length is None:
         return Ellipsoid.of(coupling.J_gt, allowed)
-    length = as_floats("characteristic_length", characteristic_length)
-    if length.shape != () or not (np.isfinite(length) and length > 0):
-        raise InputError(f"characteristic_length is {characteristic_length}; it must be a positive length, m")
+    length = as_positive("characteristic_length", characteristic_length, "it must be a positive length, m")
     return Ellipsoid.of(np.vstack([coupling.J_g[:3], length * coupling.J_g[3:]]), allowed)
 
 

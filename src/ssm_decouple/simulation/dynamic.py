@@ -18,7 +18,7 @@ from ssm_decouple.model.plant import Plant
 from ssm_decouple.model.robot import UNLIMITED, Robot
 from ssm_decouple.model.tree import Tree
 from ssm_decouple.simulation import physics
-from ssm_decouple.simulation.motion import flagged_spans, rotations_to, twist_along
+from ssm_decouple.simulation.motion import build_motion, flagged_spans, rotations_to, twist_along
 
 Floats = NDArray[np.float64]
 
@@ -318,20 +318,17 @@ class DynamicMotion:
             told = np.r_[R @ told[:3], R @ told[3:]]
         self.measured += self.directions.T @ told
 
-    def complete(self, motion: xr.Dataset) -> xr.Dataset:
-        """Return the record of the motion with the truth about the plant in it.
+    def record(self, time: Floats, seen: Floats, values: Floats, twists: Floats, targets: Floats) -> xr.Dataset:
+        """Return what `build_motion` makes of the law's robot and commands, with the truth about the plant in it.
 
-        Args:
-            motion: What `build_motion` makes of the law's robot and commands.
-
-        Returns:
-            The same with the plant's velocities, momentum and end-effector, and with the drives, the appendages and
-            the energy as further variables.
+        Velocities, momentum and end-effector are the plant's, and the drives, the appendages and the energy are further
+        variables. The arguments are those of `build_motion`.
         """
         configurations, velocities, torques, totals = (
-            np.array(part) for part in zip(*self._samples[: motion.sizes["time"]], strict=True)
+            np.array(part) for part in zip(*self._samples[: len(time)], strict=True)
         )
         momenta, centres, points, energies, carried = self._audit(configurations, velocities)
+        motion = build_motion(self.law, time, seen, values, twists, targets, (momenta, centres))
         hinges = np.array([self._positions(q) for q in configurations])[:, self.plant.hinges]
         spring = 0.5 * hinges**2 @ self.plant.stiffness[self.plant.hinges]
         replaced = {
@@ -340,9 +337,6 @@ class DynamicMotion:
             ),
             "base_linear_velocity": velocities[:, :3],
             "base_angular_velocity": velocities[:, 3:6],
-            "linear_momentum": momenta[:, :3],
-            "angular_momentum": momenta[:, 3:],
-            "centre_of_mass": centres,
             "end_effector_position": points,
             "end_effector_error": np.linalg.norm(motion.target_position.values - points, axis=1),
         }

@@ -206,7 +206,13 @@ def twist_along(
 
 
 def build_motion(
-    law: SelectiveLaw, time: Floats, configurations: Floats, values: Floats, twists: Floats, targets: Floats
+    law: SelectiveLaw,
+    time: Floats,
+    configurations: Floats,
+    values: Floats,
+    twists: Floats,
+    targets: Floats,
+    audited: tuple[Floats, Floats] | None = None,
 ) -> xr.Dataset:
     """Assemble the record of a motion from its samples.
 
@@ -217,6 +223,7 @@ def build_motion(
         values: The law's output arrays (m, law.size).
         twists: Integral of the base twist, base axes (m, 6), m and rad.
         targets: Flat targets (m, size): of one position, that position (m, 3), m, inertial axes.
+        audited: Momenta (m, 6) and centres of mass (m, 3) for the audit; None is those of what the law commands.
 
     Returns:
         The motion; its variables are listed in the documentation of `simulate`.
@@ -231,12 +238,7 @@ def build_motion(
     errors = results[:, kernel.ERRORS : kernel.ERRORS + layout.size]
     nowhere = np.full((m, 3), np.nan)
     attitude = Rotation.from_quat(configurations[:, 3:7])
-    momenta, centres = np.empty((m, 6)), np.empty((m, 3))
-    data = model.createData()
-    total, centre = data.hg, data.com[0]
-    for i in range(m):
-        pin.computeCentroidalMomentum(model, data, configurations[i], values[i, : 6 + n])
-        momenta[i], centres[i] = total.vector, centre
+    momenta, centres = audited or _audit(model, configurations, values[:, : 6 + n])
 
     arrays = {
         "configuration": configurations,
@@ -333,6 +335,16 @@ def error_of(motion: xr.Dataset) -> Floats:
 def robot_of(motion: xr.Dataset) -> Robot:
     """Return the robot of a motion, as its record holds it."""
     return Robot(str(motion.robot_urdf.item()), name=motion.attrs["robot"], end_effector=motion.attrs["end_effector"])
+
+
+def _audit(model: pin.Model, configurations: Floats, velocities: Floats) -> tuple[Floats, Floats]:
+    momenta, centres = np.empty((len(configurations), 6)), np.empty((len(configurations), 3))
+    data = model.createData()
+    total, centre = data.hg, data.com[0]
+    for i, (q, v) in enumerate(zip(configurations, velocities, strict=True)):
+        pin.computeCentroidalMomentum(model, data, q, v)
+        momenta[i], centres[i] = total.vector, centre
+    return momenta, centres
 
 
 def _joint_positions(model: pin.Model, configurations: Floats) -> Floats:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import warnings
 from collections.abc import Callable
+from functools import partial
 from typing import Any, Literal
 
 import numpy as np
@@ -14,7 +15,15 @@ from numpy.typing import ArrayLike, NDArray
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.control.schedule import ScheduledLaw
-from ssm_decouple.errors import DecoupleError, DecoupleWarning, InputError, as_floats, as_not_negative, as_triple
+from ssm_decouple.errors import (
+    DecoupleError,
+    DecoupleWarning,
+    InputError,
+    as_floats,
+    as_not_negative,
+    as_positive,
+    as_triple,
+)
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import build_motion, error_of, judge
 from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted, sample_times
@@ -106,15 +115,14 @@ def simulate(
     if not isinstance(method, Dynamic) and method not in STEPS:
         raise InputError(f"method '{method}' is unknown: use {', '.join(STEPS)} or a Dynamic")
     _refuse_unfit_method(law, method, duration, dt)
-    if not (np.isfinite(arrival_tolerance) and arrival_tolerance > 0):
-        raise InputError(f"arrival_tolerance is {arrival_tolerance}; it must be a positive distance, m")
+    tolerance = as_positive("arrival_tolerance", arrival_tolerance, "it must be a positive distance, m")
     reference = _reference(law, target)
     demand = Demand(reference, _smooth_pace(smooth_start), _wanted(law, protected_rate, method))
     run = _Run(law, law.robot.checked(q).copy(), time, demand, method)
     if law.layout.tool_target is not None:
         _warn_out_of_reach(law, run.configurations[0], reference(0.0)[0][law.layout.tool_target])
     law.check_start(run.configurations[0])
-    run.settings = {"arrival_tolerance": arrival_tolerance, "smooth_start": float(smooth_start)}
+    run.settings = {"arrival_tolerance": tolerance, "smooth_start": float(smooth_start)}
     tick = max(1, time.size // 100)
     try:
         for i in range(time.size):
@@ -123,7 +131,7 @@ def simulate(
                 if progress is not None:
                     progress(run.done / time.size)
                 # Slow on purpose is not stalled.
-                if stop_early and time[i] >= smooth_start and run.ended(arrival_tolerance):
+                if stop_early and time[i] >= smooth_start and run.ended(tolerance):
                     break
     except KeyboardInterrupt:
         if run.done == 0:
@@ -195,11 +203,8 @@ class _Run:
     def record(self) -> xr.Dataset:
         """Return the motion so far."""
         law, done, time = self.law, self.done, self.time[: self.done]
-        motion = build_motion(
-            law, time, self.configurations[:done], self.values[:done], self.twists[:done], self.targets[:done]
-        )
-        if self.dynamic is not None:
-            motion = self.dynamic.complete(motion)
+        record = partial(build_motion, law) if self.dynamic is None else self.dynamic.record
+        motion = record(time, self.configurations[:done], self.values[:done], self.twists[:done], self.targets[:done])
         outcome = judge(time, error_of(motion), self.settings["arrival_tolerance"], 1.0 / law.layout.slowest_gain)
         motion.attrs |= {
             "method": "dynamic" if self.dynamic is not None else self.method,

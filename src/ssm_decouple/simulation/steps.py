@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.control.law import GAUSS, SelectiveLaw
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import InputError, as_positive
 from ssm_decouple.momentum.flow import munthe_kaas
 
 Floats = NDArray[np.float64]
@@ -101,14 +101,13 @@ def sample_times(duration: float, dt: float) -> Floats:
     Raises:
         InputError: times that are not positive, or more steps than a record could hold.
     """
-    for name, value in (("dt", dt), ("duration", duration)):
-        if not (np.isfinite(value) and value > 0):
-            raise InputError(f"{name} is {value}; it must be a positive time, s")
+    needs = "it must be a positive time, s"
+    dt, duration = as_positive("dt", dt, needs), as_positive("duration", duration, needs)
     if dt > duration:
         raise InputError(f"dt is {dt:g} s, longer than the duration of {duration:g} s")
     if duration / dt > MOST_STEPS:
         raise InputError(f"{duration:g} s in steps of {dt:g} s are more than {MOST_STEPS:g} steps; take a longer dt")
     steps = int(np.ceil(duration / dt * (1 - 1e-12)))
-    time = float(dt) * np.arange(steps + 1, dtype=np.float64)
+    time = dt * np.arange(steps + 1, dtype=np.float64)
     time[-1] = duration
     return time

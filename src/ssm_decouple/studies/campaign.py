@@ -20,14 +20,14 @@ from numpy.typing import NDArray
 from ssm_decouple.batch import Batch
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.control.schedule import Schedule
-from ssm_decouple.errors import DecoupleError, DecoupleWarning, FileError, InputError, as_seed
+from ssm_decouple.errors import DecoupleError, DecoupleWarning, FileError, InputError, as_seed, unknown
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.perturb import Tolerances, perturbed
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.dynamic import Dynamic
 from ssm_decouple.studies.case import Case, case_of, cases, load_case
-from ssm_decouple.studies.schema import LIST, NUMBER, TEXT, check_keys, unknown
+from ssm_decouple.studies.schema import LIST, NUMBER, TEXT, check_keys
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -28,7 +28,7 @@ from ssm_decouple.control.task import (
     RelativePoseTask,
     Task,
 )
-from ssm_decouple.errors import DecoupleError, InputError, as_floats
+from ssm_decouple.errors import DecoupleError, InputError, as_floats, unknown
 from ssm_decouple.model.catalogue import load_robot, models
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
@@ -47,7 +47,6 @@ from ssm_decouple.studies.schema import (
     TEXT,
     TURNS,
     check_keys,
-    unknown,
 )
 
 if TYPE_CHECKING:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 from typing import Any
 
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import InputError, unknown
 
 # What a value must be, in words that a message can use.
 NUMBER = "a number"
@@ -42,14 +41,6 @@ def check_keys(values: Mapping[str, Any], keys: Keys, place: str) -> None:
     missing = [key for key, (_, needed) in keys.items() if needed and key not in values]
     if missing:
         raise InputError(f"{place}{missing[0]} is missing")
-
-
-def unknown(kind: str, word: str, known: list[str]) -> str:
-    """Say that a word is not known, and which known one is nearest."""
-    nearest = difflib.get_close_matches(word, known, 1, 0.5)
-    return f"unknown {kind} '{word}'" + (
-        f"; did you mean '{nearest[0]}'?" if nearest else f"; known: {', '.join(known)}"
-    )
 
 
 def _fits(value: Any, kind: str) -> bool:

@@ -8,11 +8,11 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 from scipy.stats import norm
 
 from ssm_decouple.batch import Batch
 from ssm_decouple.batch.results import Motions
+from ssm_decouple.batch.rows import move_poses, place_points
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.errors import InputError, as_floats, as_seed
 from ssm_decouple.model.robot import Robot
@@ -112,6 +112,8 @@ def random_targets(robot: Robot, starts: ArrayLike, count: int, seed: int = 0, n
             f"starts have shape {given.shape}; {count} targets of '{robot.name}' need ({count}, {robot.model.nq}), or "
             "one configuration for all"
         )
+    for q in given:
+        robot.checked(q)
     random, (low, high) = np.random.default_rng([as_seed("seed", seed), 0]), joint_ranges(robot).T
     goals = random.uniform(low, high, (count, robot.n_joints))
     configurations = np.broadcast_to(given, (count, robot.model.nq)).copy()
@@ -134,15 +136,19 @@ def end_of_path(robot: Robot, configurations: Floats, goals: Floats, intervals: 
         Positions (N, 3), m, inertial axes.
     """
     engine = Batch(robot)
-    joints = np.array([robot.joint_positions(q) for q in configurations])
-    turned, origin = Rotation.from_quat(configurations[:, 3:7]), configurations[:, :3].copy()
+    joints, poses = engine.split(configurations)
     way, h = goals - joints, 1.0 / intervals
     for i in range(intervals):
         first, second = (_twists(engine, joints + (i + node) * h * way, h * way) for node in _GAUSS)
-        shift, turn = _exponential(0.5 * (first + second) + np.sqrt(3) / 12 * _bracket(first, second))
-        origin += turned.apply(shift)
-        turned = turned * turn
-    return origin + turned.apply(engine.matrices(goals).end_effector_position)
+        move_poses(poses, 0.5 * (first + second) + np.sqrt(3) / 12 * _bracket(first, second))
+    return _tools(engine, goals, poses)
+
+
+def _tools(engine: Batch, joints: Floats, poses: Floats) -> Floats:
+    """Return where the end-effector is (N, 3), m, inertial axes."""
+    positions = engine.matrices(joints).end_effector_position.copy()
+    place_points(poses, positions)
+    return positions
 
 
 def _twists(engine: Batch, joints: Floats, rates: Floats) -> Floats:
@@ -153,16 +159,6 @@ def _bracket(a: Floats, b: Floats) -> Floats:
     """Return the Lie brackets of twists (N, 6), [linear; angular]."""
     linear = np.cross(a[:, 3:], b[:, :3]) + np.cross(a[:, :3], b[:, 3:])
     return np.hstack([linear, np.cross(a[:, 3:], b[:, 3:])])
-
-
-def _exponential(twists: Floats) -> tuple[Floats, Rotation]:
-    """Return shifts (N, 3) and rotations of SE(3)'s exponential map of twists (N, 6)."""
-    v, w = twists[:, :3], twists[:, 3:]
-    angle = np.linalg.norm(w, axis=1, keepdims=True)
-    first = 0.5 * np.sinc(angle / (2 * np.pi)) ** 2
-    second = (1.0 - np.sinc(angle / np.pi)) / np.maximum(angle**2, 1e-300)
-    across = np.cross(w, v)
-    return v + first * across + second * np.cross(w, across), Rotation.from_rotvec(w)
 
 
 @dataclass(frozen=True)
@@ -361,20 +357,17 @@ class Trials:
 
     def beyond_limits(self, name: str) -> Flags:
         """Return which motions (N,) of a law end with a joint beyond its limits."""
-        joints, limits = self._joints(self.found[name].configuration), self.targets.robot.position_limits
+        joints, limits = self.engine.split(self.found[name].configuration)[0], self.targets.robot.position_limits
         return np.any((joints < limits[:, 0]) | (joints > limits[:, 1]), axis=1)
 
     def distances(self) -> Floats:
         """Return how far the targets are from where the end-effector starts (N,), m."""
-        robot, starts = self.targets.robot, self.targets.configurations
-        tools = np.array([robot.frame_pose(q).translation for q in starts])
+        tools = _tools(self.engine, *self.engine.split(self.targets.configurations))
         return np.linalg.norm(self.targets.positions - tools, axis=1)
 
     def final_positions(self, name: str) -> Floats:
         """Return where the end-effector is at the end of each motion of a law (N, 3), m, inertial axes."""
-        ends = self.found[name].configuration
-        tool = self.engine.matrices(self._joints(ends)).end_effector_position
-        return ends[:, :3] + Rotation.from_quat(ends[:, 3:7]).apply(tool)
+        return _tools(self.engine, *self.engine.split(self.found[name].configuration))
 
     def rows(self) -> list[Arrival]:
         """Return a row for each law that was finished."""
@@ -457,7 +450,7 @@ class Trials:
         U, k = law.protection.U_twist, law.protection.k
         fewer = [Protection(np.delete(U, i, axis=1)) if k > 1 else Protection("none") for i in range(k)]
         tried = [law.protection, *fewer, Protection("none")]
-        sigma = self.engine.singular_values(self._joints(found.configuration[held]), tried)
+        sigma = self.engine.singular_values(self.engine.split(found.configuration[held])[0], tried)
         words = np.array([*row_names(law.protection), SEVERAL, ARM, ELSEWHERE])
         told = np.full(len(found.outcome), "", dtype=words.dtype)
         own, best = sigma[:, 0], sigma[:, 1:-1].argmax(axis=1) if k else np.zeros(len(held), dtype=int)
@@ -465,10 +458,6 @@ class Trials:
         cause = np.where(row, best, np.where(sigma[:, -1] > 2 * own, k, k + 1))
         told[held] = words[np.where(own >= law.damping_threshold, k + 2, cause)]
         return told
-
-    def _joints(self, configurations: Floats) -> Floats:
-        joints = [self.targets.robot.joint_positions(q) for q in configurations]
-        return np.array(joints).reshape(-1, self.targets.robot.n_joints)
 
 
 def laws_to_try(case: Case) -> dict[str, SelectiveLaw]:
