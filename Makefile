@@ -3,6 +3,8 @@
 PYTHON ?= python3
 BIN := .venv/bin
 KATEX := 0.16.47
+# Where Python is told to keep no compiled modules, each of the many processes here would compile all that it imports.
+unexport PYTHONDONTWRITEBYTECODE
 
 .PHONY: cases view test slow lint types snippets tables tables-check docs wheel benchmarks clean
 

@@ -40,7 +40,7 @@ def test_help_teaches():
 
 
 def test_run_writes_the_motion_and_the_figures(call, tmp_path):
-    done = in_a_process("run", "case1", "--no-progress", cwd=tmp_path)
+    done = call("run", "case1", "--no-progress", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "converged, 102 s" in done.stdout
     names = {path.name for path in (tmp_path / "results" / "case1").iterdir()}
@@ -141,17 +141,17 @@ def test_bad_input_is_one_line_and_status_1(call, tmp_path, words, says):
     assert not list(tmp_path.rglob("*.nc"))
 
 
-def test_an_output_that_cannot_be_written(tmp_path):
+def test_an_output_that_cannot_be_written(call, tmp_path):
     (tmp_path / "taken").write_text("")
-    done = in_a_process("run", "case1", "--output", tmp_path / "taken")
+    done = call("run", "case1", "--output", tmp_path / "taken")
     assert done.returncode == 1
     assert "error: cannot write to the folder" in done.stderr
     assert "choose another with --output" in done.stderr
 
 
-def test_wrong_usage_is_status_2():
-    assert in_a_process("run").returncode == 2
-    assert in_a_process("fly").returncode == 2
+def test_wrong_usage_is_status_2(call):
+    assert call("run").returncode == 2
+    assert call("fly").returncode == 2
 
 
 def test_a_target_out_of_reach_warns_and_runs(write, tmp_path):
