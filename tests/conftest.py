@@ -17,7 +17,15 @@ import ssm_decouple as ssm
 settings.register_profile("seeded", derandomize=True, deadline=None)
 settings.load_profile("seeded")
 
+# Files whose tests take many seconds each: other programs, whole motions.
+LONG = ("test_viewer_browser", "test_examples", "test_notebooks", "test_cli", "test_cli_campaign", "test_jax")
+
 UR5 = "ur_description/urdf/ur5_robot.urdf"
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with what is long, so that at the end no worker waits for another."""
+    items.sort(key=lambda item: item.path.stem not in LONG)
 
 
 @pytest.fixture(scope="session")

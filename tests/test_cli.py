@@ -1,4 +1,4 @@
-"""The command as a user types it, in a process of its own where the shell sees more than words, streams and status."""
+"""The command as a user types it, in a process of its own where a signal comes from outside or a warning is told."""
 
 from __future__ import annotations
 
@@ -17,10 +17,6 @@ import ssm_decouple as ssm
 from ssm_decouple.cli import app
 
 COMMAND = [sys.executable, "-c", "from ssm_decouple.cli import main; main()"]
-
-
-def in_a_process(*words, cwd=None):
-    return subprocess.run([*COMMAND, *map(str, words)], capture_output=True, text=True, cwd=cwd, timeout=120)
 
 
 @pytest.fixture
@@ -156,7 +152,8 @@ def test_wrong_usage_is_status_2(call):
 
 def test_a_target_out_of_reach_warns_and_runs(write, tmp_path):
     text = ssm.cases()["case1"].read_text().replace("[-1.8, -0.3, 1.2]", "[-1.8, -0.3, 9.0]").replace("150  #", "2  #")
-    done = in_a_process("run", write(text, "far.toml"), "--no-figures", "-o", tmp_path)
+    words = [*COMMAND, "run", write(text, "far.toml"), "--no-figures", "-o", tmp_path]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=120)
     assert done.returncode == 3
     assert "warning: the target (-1.8, -0.3, 9) m is 5.14 m beyond the arm's reach" in done.stderr
 

@@ -87,10 +87,11 @@ def test_a_row_that_was_tampered_with_is_told(call, campaign_file, tmp_path):
     assert "other bits" in call("campaign", "rerun", tmp_path / "s", "5", "-o", tmp_path).stdout
 
 
-def test_a_sample_that_failed_is_rerun(call, campaign_file, tmp_path):
+def test_a_sample_that_failed_is_rerun(call, campaign_file, tmp_path, monkeypatch):
     short = campaign_file.with_name("short.toml")
     short.write_text(short.read_text().replace("dt = 0.1", 'dt = 0.1\nmethod = "dynamic"'))
     campaign_file.write_text(TEXT + "[dynamic]\nfeedback_gain = { choice = [20] }\n")
+    monkeypatch.setattr(os, "cpu_count", lambda: 1)  # as many processes as that, where no number is given
     assert call("campaign", "run", campaign_file, "-o", tmp_path / "s").returncode == 0
     told = json.loads(call("campaign", "rerun", tmp_path / "s", "0", "-o", tmp_path / "out", "--json").stdout)
     assert (told["same_bits"], told["motion"]) == (True, None)

@@ -419,6 +419,15 @@ def test_a_full_disk_stops_it_and_room_lets_it_go_on(load, tmp_path):
 # Who computes it
 
 
+@pytest.fixture
+def interruptible():
+    """Heed Ctrl-C, which a shell's background jobs ignore."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+@pytest.mark.usefixtures("interruptible")
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_an_interrupt_that_python_drops_is_heeded(load, tmp_path):
     """One that comes while an object is cleared up goes no further than a notice."""
@@ -437,6 +446,7 @@ def test_an_interrupt_that_python_drops_is_heeded(load, tmp_path):
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 
+@pytest.mark.usefixtures("interruptible")
 def test_an_interrupt_waits_for_the_end_of_a_write(load, tmp_path, monkeypatch):
     write, seen = Store.write, []
 

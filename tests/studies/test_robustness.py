@@ -13,7 +13,8 @@ from ssm_decouple.viewing.table import effect_table, leak_table
 
 @pytest.fixture(scope="module")
 def campaign():
-    study = Robustness(ssm.load_case("case1"), levels=(0.02, 0.05), runs=4)
+    case = replace(ssm.load_case("case1"), duration=120.0)  # the arm arrives after some 102 s
+    study = Robustness(case, levels=(0.02, 0.05), runs=4)
     study.run()
     return study
 
