@@ -14,7 +14,7 @@ import time
 os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 import numpy as np
-from playwright.sync_api import Page, sync_playwright
+from playwright.sync_api import Browser, sync_playwright
 
 import ssm_decouple as ssm
 from ssm_decouple.studies.bending import flexible
@@ -24,7 +24,10 @@ from ssm_decouple.viewing.viewer.player import Player
 
 FLAGS = ["--no-sandbox", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 SIZES = ((700, 300), (900, 500), (1300, 800))  # of the page, of which the controls take 380 pixels of width
-SETTLING, SECONDS = 8.0, 6.0  # the page draws with fewer pixels where its frames come late, which takes it some seconds
+SETTLING, SECONDS = (
+    12.0,
+    6.0,
+)  # where frames come late the page takes some seconds to draw fewer pixels
 SPEED = "5 x"  # at which a motion of 150 s outlasts both
 DRAGS = 100
 COUNT = """seconds => new Promise(done => {
@@ -43,14 +46,18 @@ CARD = """() => {
 }"""
 
 
-def frames(page: Page, size: tuple[int, int], player: Player) -> tuple[float, float]:
-    """Return frames a second, drawn and sent."""
-    page.set_viewport_size({"width": size[0], "height": size[1]})
+def frames(browser: Browser, size: tuple[int, int], player: Player) -> tuple[float, float, str]:
+    """Return frames a second, drawn and sent, of a page that is opened, and what draws it."""
+    page = browser.new_page(viewport={"width": size[0], "height": size[1]})
+    page.goto(player.url)
+    page.wait_for_timeout(4000)
     player.seek(0.0)
     page.wait_for_timeout(1e3 * SETTLING)
     before = player.frames
-    drawn = float(page.evaluate(COUNT, SECONDS))
-    return drawn, (player.frames - before) / SECONDS
+    drawn, card = float(page.evaluate(COUNT, SECONDS)), str(page.evaluate(CARD))
+    sent = (player.frames - before) / SECONDS
+    page.close()
+    return drawn, sent, card
 
 
 def playback() -> None:
@@ -60,15 +67,13 @@ def playback() -> None:
     motion = dataclasses.replace(case, simulation={**case.simulation, "method": method}).run()
     with ssm.view(motion, port=0) as player, sync_playwright() as running:
         browser = running.chromium.launch(executable_path=str(find_browser()), args=FLAGS)
-        page = browser.new_page()
-        page.goto(player.url)
-        page.wait_for_timeout(4000)
         player.speed.value = SPEED  # type: ignore[misc]  # viser's setter stands in a class between
-        print(f"{motion.sizes['time']} samples, {os.cpu_count()} processors, drawn by {page.evaluate(CARD)}")
+        print(f"{motion.sizes['time']} samples, {os.cpu_count()} processors")
         print(f"{'page (pixels)':<16} {'drawn/s':>8} {'sent/s':>8}")
         for size in SIZES:
-            drawn, sent = frames(page, size, player)
+            drawn, sent, card = frames(browser, size, player)
             print(f"{size[0]:>5} x {size[1]:<8} {drawn:8.1f} {sent:8.1f}")
+        print(f"drawn by {card}")
         browser.close()
 
 
