@@ -22,7 +22,7 @@ law = ssm.SelectiveLaw(robot, ssm.Protection("yaw"), sample_time=0.1, hold_nodes
 unprotected = yaw(free, ssm.Dynamic(step=0.02))
 print(f"nothing protected: {unprotected:.4f} deg; the model right: {yaw(law, ssm.Dynamic(step=0.02)):.1e} deg")
 for seed in range(3):
-    plant = ssm.perturbed(robot, ssm.Tolerances(0.05, 0.05, centre_of_mass=0.005, mount=0.005), seed)
+    plant = ssm.perturbed(robot, ssm.Tolerances(0.05, 0.05, centre_of_mass=0.005, mount=0.005, length=0.005), seed)
     plain = yaw(law, ssm.Dynamic(step=0.02, plant=plant))
     fed_back = yaw(law, ssm.Dynamic(step=0.02, plant=plant, feedback_gain=1.0))
     print(

@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -9,8 +11,9 @@ from random_robots import random_robot
 
 import ssm_decouple as ssm
 from ssm_decouple.model.perturb import Tolerances, perturbed
+from ssm_decouple.model.urdf import root_link
 
-ALL = Tolerances(mass=0.1, inertia=0.2, centre_of_mass=0.02, mount=0.05)
+ALL = Tolerances(mass=0.1, inertia=0.2, centre_of_mass=0.02, mount=0.05, length=0.01)
 
 
 def bodies(robot: ssm.Robot) -> list[pin.Inertia]:
@@ -87,6 +90,7 @@ def test_each_tolerance_moves_what_it_names(ets_vii):
     assert changed(inertia=0.1) == (False, True, False, False)
     assert changed(centre_of_mass=0.01) == (False, False, True, False)
     assert changed(mount=0.01) == (False, False, False, True)
+    assert changed(length=0.01) == (False, False, False, True)
 
 
 def test_the_draw_is_uniform_and_fills_its_range(ets_vii):
@@ -107,6 +111,35 @@ def test_only_the_mount_moves(ets_vii):
     np.testing.assert_array_equal(rest, np.zeros((5, 3)))
 
 
+@pytest.mark.parametrize("name", ["ets_vii", "composed", "random_3"])
+def test_only_what_stands_on_other_links_than_the_root_is_off_in_length(robots, name):
+    robot = robots[name]
+    off, root = perturbed(robot, Tolerances(length=0.005), 3), ET.fromstring(robot.urdf)
+    on_base = {j.get("name") for j in root.findall("joint") if j.find("parent").get("link") == root_link(root)}
+    names = {j.get("name") for j in root.findall("joint")}
+    moved = {}
+    for joint in ET.fromstring(off.urdf).findall("joint"):
+        before = next(j for j in root.findall("joint") if j.get("name") == joint.get("name")).find("origin")
+        xyz = [
+            [float(x) for x in (o.get("xyz", "0 0 0").split() if o is not None else "000")]
+            for o in (before, joint.find("origin"))
+        ]
+        moved[joint.get("name")] = np.abs(np.subtract(*xyz))
+    assert moved.keys() == names
+    for joint, by in moved.items():
+        assert (by == 0).all() if joint in on_base else ((by > 0) & (by <= 0.005)).all()
+    # The end-effector stands off by no more than the sum, and its place is what the law does not know.
+    q = robot.configuration(np.full(robot.n_joints, 0.4))
+    apart = np.linalg.norm(off.frame_pose(q).translation - robot.frame_pose(q).translation)
+    assert 0 < apart <= 0.005 * np.sqrt(3) * len(names)
+
+
+def test_lengths_leave_the_other_draws_as_they_are(ets_vii):
+    one, other = (perturbed(ets_vii, Tolerances(0.1, 0.2, 0.02, 0.05, length), 7) for length in (0.0, 0.01))
+    assert [b.mass for b in bodies(one)] == [b.mass for b in bodies(other)]
+    np.testing.assert_array_equal(one.model.jointPlacements[2].translation, other.model.jointPlacements[2].translation)
+
+
 def test_the_appendages_stay():
     robot = ssm.load_robot("ets_vii_flexible")
     off = perturbed(robot, ALL, 3)
@@ -124,6 +157,7 @@ def test_the_appendages_stay():
         ({"inertia": 1.5}, "tolerance of inertia is 1.5"),
         ({"centre_of_mass": -1e-9}, "tolerance of centre_of_mass is -1e-09; it must be at least 0"),
         ({"mount": np.inf}, "tolerance of mount is inf"),
+        ({"length": -1.0}, "tolerance of length is -1.0"),
     ],
 )
 def test_bad_tolerances_are_refused(tolerance, says):

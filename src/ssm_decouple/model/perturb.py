@@ -24,12 +24,15 @@ class Tolerances:
         inertia: Of each link about its centre of mass, relative, beside the mass.
         centre_of_mass: Of each link, m, along each of its axes.
         mount: Of what stands on the root link, m, along each axis of the base.
+        length: Of every other link, m, along each of its axes: how far what it holds, the next joint or the
+            end-effector, is from where the model has it. An arm that has been calibrated has a small one.
     """
 
     mass: float = 0.0
     inertia: float = 0.0
     centre_of_mass: float = 0.0
     mount: float = 0.0
+    length: float = 0.0
 
     def __post_init__(self) -> None:
         """Refuse what is no tolerance.
@@ -37,7 +40,8 @@ class Tolerances:
         Raises:
             InputError: a negative number, or a relative one of 1 or more.
         """
-        for name, largest in (("mass", 1.0), ("inertia", 1.0), ("centre_of_mass", np.inf), ("mount", np.inf)):
+        for name in ("mass", "inertia", "centre_of_mass", "mount", "length"):
+            largest = 1.0 if name in ("mass", "inertia") else np.inf
             value = as_floats(f"tolerance of {name}", getattr(self, name))
             if value.shape != () or not (np.isfinite(value) and 0 <= value < largest):
                 raise InputError(
@@ -46,7 +50,7 @@ class Tolerances:
 
 
 def perturbed(robot: Robot, tolerances: Tolerances, seed: int | np.random.Generator) -> Robot:
-    """Return a robot whose masses, inertias, centres of mass and mounts are off by random amounts.
+    """Return a robot whose masses, inertias, centres of mass, mounts and lengths are off by random amounts.
 
     Each inertia stays that of a solid body: along each of its own axes the body is stretched a little.
 
@@ -66,10 +70,12 @@ def perturbed(robot: Robot, tolerances: Tolerances, seed: int | np.random.Genera
     for inertial in root.findall("link/inertial"):
         _disturb_body(inertial, tolerances, rng)
     base = root_link(root)
-    for joint in root.findall("joint"):
-        parent = joint.find("parent")
-        if parent is not None and parent.get("link") == base:
-            _shift(joint, tolerances.mount * rng.uniform(-1, 1, 3))
+    # Mounts first: a seed means the same masses and mounts whatever the tolerance of the lengths is.
+    for on_base, tolerance in ((True, tolerances.mount), (False, tolerances.length)):
+        for joint in root.findall("joint"):
+            parent = joint.find("parent")
+            if parent is not None and (parent.get("link") == base) is on_base:
+                _shift(joint, tolerance * rng.uniform(-1, 1, 3))
     return Robot(
         ET.tostring(root, encoding="unicode"),
         name=f"{robot.name} (perturbed)",

@@ -49,7 +49,7 @@ _TOP: dict[str, tuple[str, bool]] = {
     "samples": (NUMBER, True),
     "chunk": (NUMBER, False),
 }
-_TOLERANCES = dict.fromkeys(("mass", "inertia", "centre_of_mass", "mount"), (NUMBER, False))
+_TOLERANCES = dict.fromkeys(("mass", "inertia", "centre_of_mass", "mount", "length"), (NUMBER, False))
 
 
 @dataclass(frozen=True)

@@ -29,7 +29,8 @@ class Leak:
 
     Attributes:
         case: Name of the case.
-        level: Tolerance of masses and inertias, relative; of centres of mass and mounts, that many tenths of a metre.
+        level: Tolerance of masses and inertias, relative; of centres of mass, mounts and link lengths, that many tenths of
+            a metre.
         feedback_gain: K, 1/s; 0 for none.
         runs: Number of random plants.
         median_deg: Median over the plants of the largest true rotation about a protected axis.
@@ -101,7 +102,8 @@ def true_rotation(case: Case, physics: Dynamic, protection: Protection | None = 
 
 def tolerances_at(level: float) -> Tolerances:
     """Return the tolerances of a level of error."""
-    return Tolerances(level, level, METRES_PER_LEVEL * level, METRES_PER_LEVEL * level)
+    length = METRES_PER_LEVEL * level
+    return Tolerances(level, level, length, length, length)
 
 
 def _one_run(case: Case, level: float, gain: float, seed: int) -> tuple[float, bool]:
