@@ -29,8 +29,8 @@ class Leak:
 
     Attributes:
         case: Name of the case.
-        level: Tolerance of masses and inertias, relative; of centres of mass, mounts and link lengths, that many tenths of
-            a metre.
+        level: Tolerance of masses and inertias, relative; of centres of mass, mounts and lengths, that many tenths of a
+            metre.
         feedback_gain: K, 1/s; 0 for none.
         runs: Number of random plants.
         median_deg: Median over the plants of the largest true rotation about a protected axis.
