@@ -25,6 +25,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 import ssm_decouple as ssm
+from ssm_decouple.control import paper
 
 Floats = NDArray[np.float64]
 
@@ -55,33 +56,21 @@ def medians(candidates: dict[str, Callable[[], object]]) -> dict[str, float]:
     return {name: statistics.median(values) for name, values in times.items()}
 
 
-def plain_numpy(case: ssm.Case, q: Floats) -> Callable[[], dict[str, object]]:
-    """Return the same law in plain NumPy, with the same results, as one would write it from the paper."""
+def plain_numpy(case: ssm.Case, q: Floats) -> Callable[[], Floats]:
+    """Return the paper's law as one writes it from the paper, on the same matrices: `ssm_decouple.control.paper`."""
     robot, law = case.robot, case.make_law()
     model, data, frame = robot.model, robot.model.createData(), robot.end_effector_id
-    U_c, target, limits, identity = law.protection.U_c, np.array(case.target), law.rate_limits, np.eye(robot.n_joints)
+    U_c, x_des, still = law.protection.U_c, np.array(case.target), np.zeros(3)
 
-    def step() -> dict[str, object]:
+    def step() -> Floats:
         pin.computeCentroidalMap(model, data, q)
         pin.updateFramePlacement(model, data, frame)
         J = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
-        A_g = data.Ag
-        J_base = -np.linalg.solve(A_g[:, :6], A_g[:, 6:])
-        J_g = (J[:, 6:] + J[:, :6] @ J_base)[:3]
-        J_sub = U_c.T @ J_base[3:]
-        J_g_N = J_g @ (identity - np.linalg.pinv(J_sub) @ J_sub)
-        error = target - data.oMf[frame].translation
-        rates = np.linalg.pinv(J_g_N) @ (law.gain * error)
-        scale = min(1.0, (limits / np.maximum(np.abs(rates), 1e-300)).min())
-        rates = scale * rates
-        return {
-            "joint_rates": rates,
-            "base_twist": J_base @ rates,
-            "protected_rate": J_sub @ rates,
-            "end_effector_error": error,
-            "smallest_singular_value": np.linalg.svd(J_g_N, compute_uv=False)[-1],
-            "rate_scale": scale,
-        }
+        J_base = -np.linalg.solve(data.Ag[:, :6], data.Ag[:, 6:])
+        J_gt = (J[:, 6:] + J[:, :6] @ J_base)[:3]
+        v_cmd = paper.task_velocity(still, law.gain, x_des, data.oMf[frame].translation)
+        rates = paper.selective_law(J_base[3:], J_gt, U_c, v_cmd, law.damping, law.damping_threshold)
+        return paper.scaled_to_limits(rates, law.rate_limits)
 
     return step
 
@@ -188,7 +177,7 @@ def main(name: str) -> None:
         "Pinocchio's bare calls": floor,
         "law.evaluate(q, target, velocity, out)": lambda: law.evaluate(q, target, at_rest, out),
         "law(q, target)": lambda: law(q, target),
-        "plain NumPy with pinv": plain,
+        "the paper in plain NumPy": plain,
     }
     for nodes in (1, 2, 3):
         planned = ssm.SelectiveLaw(
@@ -201,7 +190,7 @@ def main(name: str) -> None:
     candidates["law(q, target), limits by QP"] = lambda: limiting(q, target, previous_rates=at_rest_joints)
     acting = limiting(q, target, previous_rates=at_rest_joints).active_limits
     command = law(q, target)
-    difference = np.abs(np.asarray(plain()["joint_rates"]) - command.joint_rates).max()
+    difference = np.abs(plain() - command.joint_rates).max()
     print(f"{name}, {case.robot.name}, k = {law.protection.k}: plain NumPy differs by {difference:.1e} rad/s")
     try:
         pink = pink_step(case, q)
@@ -223,7 +212,7 @@ def main(name: str) -> None:
     print(f"\n{'median of ' + str(ROUNDS) + ' rounds':<42} {'us':>8} {'/ bare':>9} {'/ law(..)':>10}")
     for label, value in times.items():
         print(f"{label:<42} {1e6 * value:8.2f} {value / base:9.2f} {value / whole:10.2f}")
-    print(f"\nlaw(q, target) is {times['plain NumPy with pinv'] / whole:.1f} times faster than plain NumPy", end="")
+    print(f"\nlaw(q, target) is {times['the paper in plain NumPy'] / whole:.1f} times faster than plain NumPy", end="")
     if "Pink, hard constraints, DAQP" in times:
         print(f", {times['Pink, hard constraints, DAQP'] / whole:.1f} times faster than Pink", end="")
     print(f",\nand takes {whole / base:.2f} times the bare Pinocchio calls; its array form {array / base:.2f} times.")

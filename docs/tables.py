@@ -8,6 +8,7 @@ python docs/tables.py speed robustness ..   # rewrite blocks that no check holds
 
 from __future__ import annotations
 
+import inspect
 import json
 import re
 import shutil
@@ -26,6 +27,7 @@ import xarray as xr
 from matplotlib.figure import Figure
 
 import ssm_decouple as ssm
+from ssm_decouple.control import paper
 from ssm_decouple.studies.bending import Bending, bending, flexible
 from ssm_decouple.studies.comparison import Summary, summarise
 from ssm_decouple.studies.pointing import Pointing, pointing
@@ -231,7 +233,14 @@ def reactionless() -> str:
     return page.split("<!-- begin reactionless -->\n\n")[1].split("\n\n<!-- end reactionless -->")[0]
 
 
+def paper_law() -> str:
+    """Return the law's function from its file, as code that runs on the page."""
+    source = inspect.getsource(paper.selective_law)
+    return f"```python\nfrom numpy import ndarray as Floats\n\n\n{source.strip()}\n```"
+
+
 BLOCKS: dict[str, Callable[[], str]] = {
+    "paper": paper_law,
     "cases": lambda: cases_table(""),
     "flight": lambda: cases_table("_flight"),
     "stalls": stalls,
