@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssm_decouple.control.kernel import compiled, inlined, unlocked
+from ssm_decouple.compiled import compiled, inlined, unlocked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

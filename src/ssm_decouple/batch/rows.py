@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssm_decouple.control.kernel import compiled, unlocked
+from ssm_decouple.compiled import compiled, unlocked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

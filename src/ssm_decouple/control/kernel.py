@@ -9,40 +9,17 @@ function must not call one that stands in another file.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from functools import partial
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING
 
-import numba
 import numpy as np
+
+from ssm_decouple.compiled import compiled, compiled_for, inlined, unlocked
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
 
-F = TypeVar("F", bound=Callable[..., Any])
-
-
-def compiled_for(*signature: str, inline: str = "never") -> Callable[[F], F]:
-    """Compile with Numba and keep the machine code on disk.
-
-    With a signature it is compiled for that one only: an array of another layout must not start a second compilation.
-    """
-
-    def decorate(function: F) -> F:
-        njit: Any = partial(numba.njit, *signature, inline=inline, error_model="numpy")
-        try:
-            return cast(F, njit(cache=True)(function))
-        except RuntimeError:  # no folder can be written: compile anew in each process
-            return cast(F, njit()(function))
-
-    return decorate
-
-
-compiled = compiled_for()
-# Compiled into the caller: for what is called in one or two places, where a call would cost as much as the work.
-inlined = compiled_for(inline="always")
 
 _MATRIX, _ROWS, _VECTOR = "float64[::1, :]", "float64[:, ::1]", "float64[::1]"
 # Pinocchio's matrices are stored by columns, everything else by rows.
@@ -1409,15 +1386,6 @@ def rates_of(
 
 
 # For many configurations at once: the same law, row by row.
-
-
-def unlocked(function: F) -> F:
-    """Compile as `compiled` does; other Python threads go on while the function runs."""
-    njit: Any = partial(numba.njit, nogil=True, error_model="numpy")
-    try:
-        return cast(F, njit(cache=True)(function))
-    except RuntimeError:
-        return cast(F, njit()(function))
 
 
 @unlocked

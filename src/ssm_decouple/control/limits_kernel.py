@@ -10,14 +10,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssm_decouple.control.kernel import compiled_for
+from ssm_decouple.compiled import compiled
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     Floats = NDArray[np.float64]
-
-compiled = compiled_for()
 
 # What `prepare` returns.
 INSIDE = 0  # the plain rates keep all limits

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ssm_decouple.control.kernel import compiled
+from ssm_decouple.compiled import compiled
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
