@@ -5,13 +5,15 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
+import warnings
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ssm_decouple.errors import InputError, ModelError, unknown
+from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, unknown
 from ssm_decouple.model.appendage import Appendage
+from ssm_decouple.model.massless import massless_root
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.model.urdf import read_urdf
 
@@ -96,7 +98,10 @@ def load_robot(source: str | Path, end_effector: str | None = None) -> Robot:
     """
     found = describe(source)
     text, tool = read_urdf(found.urdf), end_effector or found.end_effector
-    return Robot(text, name=found.name, end_effector=tool, appendages=found.appendages)
+    robot = Robot(text, name=found.name, end_effector=tool, appendages=found.appendages)
+    for finding in massless_root(robot.model):  # an arm that compose puts on a bus is no mistake, one that floats is
+        warnings.warn(f"robot '{robot.name}': {finding}", DecoupleWarning, stacklevel=2)
+    return robot
 
 
 def describe(source: str | Path) -> Description:

@@ -10,6 +10,7 @@ import numpy as np
 
 from ssm_decouple.errors import DecoupleError
 from ssm_decouple.model.appendage import inspect_remaining_bus, remaining_bus
+from ssm_decouple.model.massless import massless_joints, massless_root
 from ssm_decouple.model.urdf import Finding, inspect_urdf, parse_urdf, read_urdf, root_link, tip_links
 
 if TYPE_CHECKING:
@@ -186,7 +187,12 @@ class Report:
             tips=tuple(tip_links(root)),
             frames=tuple(robot.link_names),
             joints=tuple(joints),
-            findings=(*inspect_urdf(root), *inspect_remaining_bus(root, robot.appendages)),
+            findings=(
+                *inspect_urdf(root),
+                *massless_root(model),
+                *massless_joints(model),
+                *inspect_remaining_bus(root, robot.appendages),
+            ),
             flexible=FlexibleReport.of_robot(robot) if robot.appendages else None,
         )
 
