@@ -12,7 +12,10 @@ from hypothesis import strategies as st
 import ssm_decouple as ssm
 from ssm_decouple.model.massless import massless_joints, refuse_singular_mass_matrix
 
-BALL = '<inertial><origin xyz="{x} 0 0"/><mass value="{m}"/><inertia ixx="{i}" ixy="0" ixz="0" iyy="{i}" iyz="0" izz="{i}"/></inertial>'
+BALL = (
+    '<inertial><origin xyz="{x} 0 0"/><mass value="{m}"/><inertia ixx="{i}" ixy="0" ixz="0" iyy="{i}" iyz="0" '
+    'izz="{i}"/></inertial>'
+)
 
 
 def link(name, mass=0.0, inertia=0.0, at=0.0):
@@ -122,9 +125,9 @@ def case(tmp_path):
     )
     path = tmp_path / "probe.toml"
     path.write_text(
-        'title = "t"\nrobot = "probe.urdf"\nend_effector = "hand"\n[start]\njoints_deg = { shoulder = 20, elbow = 30 }\n[target]\n'
-        'position = [1.3, 0.6, -0.2]\n[protection]\naxes = "yaw"\n[law]\ngain = 0.05\n[simulation]\nduration = 1\n'
-        "dt = 0.1\n"
+        'title = "t"\nrobot = "probe.urdf"\nend_effector = "hand"\n[start]\njoints_deg = {shoulder = 20, elbow = 30}\n'
+        '[target]\nposition = [1.3, 0.6, -0.2]\n[protection]\naxes = "yaw"\n[law]\ngain = 0.05\n[simulation]\n'
+        "duration = 1\ndt = 0.1\n"
     )
     return path
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 import pinocchio as pin
 import scipy.linalg
@@ -44,7 +42,7 @@ def massless_joints(model: pin.Model) -> list[Finding]:
     return found
 
 
-def refuse_singular_mass_matrix(model: pin.Model, q: Floats, name: str, free: Sequence[int] | None = None) -> None:
+def refuse_singular_mass_matrix(model: pin.Model, q: Floats, name: str, free: NDArray[np.int64] | None = None) -> None:
     """Refuse a robot whose mass matrix is singular at a configuration, so that torques do not determine its motion.
 
     The rows are eliminated from the tips to the base, as in the articulated-body algorithm (Featherstone, Rigid Body
