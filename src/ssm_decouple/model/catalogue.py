@@ -5,15 +5,17 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
+import warnings
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ssm_decouple.errors import InputError, ModelError, unknown
+from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, unknown
 from ssm_decouple.model.appendage import Appendage
+from ssm_decouple.model.formats import read_robot
+from ssm_decouple.model.massless import massless_root
 from ssm_decouple.model.robot import Robot
-from ssm_decouple.model.urdf import read_urdf
 
 _PACKAGE = Path(__file__).parents[1]
 # Installed, the models lie inside the package; in a source tree they lie at its top.
@@ -95,8 +97,11 @@ def load_robot(source: str | Path, end_effector: str | None = None) -> Robot:
             unknown key (the nearest known one is named), a missing one, or an appendage that makes no sense.
     """
     found = describe(source)
-    text, tool = read_urdf(found.urdf), end_effector or found.end_effector
-    return Robot(text, name=found.name, end_effector=tool, appendages=found.appendages)
+    text, tool = read_robot(found.urdf), end_effector or found.end_effector
+    robot = Robot(text, name=found.name, end_effector=tool, appendages=found.appendages)
+    for finding in massless_root(robot.model):  # an arm that compose puts on a bus is no mistake, one that floats is
+        warnings.warn(f"robot '{robot.name}': {finding}", DecoupleWarning, stacklevel=2)
+    return robot
 
 
 def describe(source: str | Path) -> Description:

@@ -13,8 +13,9 @@ from numpy.typing import ArrayLike
 from ssm_decouple.errors import ModelError, as_floats
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.catalogue import describe
+from ssm_decouple.model.formats import read_robot
 from ssm_decouple.model.robot import Robot, rigid_pose
-from ssm_decouple.model.urdf import parse_urdf, read_urdf, root_link, tip_links, triple
+from ssm_decouple.model.urdf import parse_urdf, root_link, tip_links, triple
 
 
 def compose(
@@ -84,7 +85,7 @@ def _parts(source: str | Path | Robot) -> tuple[str, str, str | None, tuple[Appe
     if isinstance(source, Robot):
         return source.urdf, source.name, source.end_effector, source.appendages
     found = describe(source)
-    return read_urdf(found.urdf), found.name, found.end_effector, found.appendages
+    return read_robot(found.urdf), found.name, found.end_effector, found.appendages
 
 
 def _tool(part: ET.Element, arm_name: str, wanted: str | None, known: str | None) -> str:

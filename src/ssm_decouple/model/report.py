@@ -10,7 +10,8 @@ import numpy as np
 
 from ssm_decouple.errors import DecoupleError
 from ssm_decouple.model.appendage import inspect_remaining_bus, remaining_bus
-from ssm_decouple.model.urdf import Finding, inspect_urdf, parse_urdf, read_urdf, root_link, tip_links
+from ssm_decouple.model.massless import massless_joints, massless_root
+from ssm_decouple.model.urdf import Finding, inspect_urdf, parse_urdf, root_link, tip_links
 
 if TYPE_CHECKING:
     from ssm_decouple.model.robot import Robot
@@ -140,10 +141,11 @@ class Report:
             ModelError: the file cannot be read, is not XML or not a URDF; a TOML file is no robot.
         """
         from ssm_decouple.model.catalogue import describe
+        from ssm_decouple.model.formats import read_robot
         from ssm_decouple.model.robot import Robot
 
         described = describe(path)
-        text, name = read_urdf(described.urdf), described.name
+        text, name = read_robot(described.urdf), described.name
         root = parse_urdf(text, str(described.urdf))
         findings = inspect_urdf(root)
         if any(finding.level == "impossible" for finding in findings):
@@ -186,7 +188,12 @@ class Report:
             tips=tuple(tip_links(root)),
             frames=tuple(robot.link_names),
             joints=tuple(joints),
-            findings=(*inspect_urdf(root), *inspect_remaining_bus(root, robot.appendages)),
+            findings=(
+                *inspect_urdf(root),
+                *massless_root(model),
+                *massless_joints(model),
+                *inspect_remaining_bus(root, robot.appendages),
+            ),
             flexible=FlexibleReport.of_robot(robot) if robot.appendages else None,
         )
 

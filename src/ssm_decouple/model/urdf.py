@@ -85,9 +85,20 @@ def inspect_urdf(root: ET.Element) -> list[Finding]:
     """Say everything that is impossible, suspicious or worth a note in a parsed URDF."""
     try:
         tree = _inspect_tree(root)
-        return [*tree, *_inspect_places(root), *_inspect_joints(root), *_inspect_inertias(root)]
+        return [*tree, *_inspect_places(root), *_inspect_joints(root), *_inspect_inertias(root), *_left_out(root)]
     except (ValueError, TypeError, AttributeError) as error:
         return [Finding("impossible", "file", f"a number or a name is missing or malformed ({error})")]
+
+
+def _left_out(root: ET.Element) -> list[Finding]:
+    """Return what a conversion into URDF could not keep, which it has left in the links and joints."""
+    return [
+        Finding("suspicious" if told.get("level") == "suspicious" else "note", f"{kind} {element.get('name')}", text)
+        for kind in ("link", "joint")
+        for element in root.findall(kind)
+        for told in element.findall("left_out")
+        if (text := told.text)
+    ]
 
 
 def _inspect_places(root: ET.Element) -> list[Finding]:
@@ -365,19 +376,31 @@ def root_link(root: ET.Element) -> str:
 
 
 def tip_links(root: ET.Element) -> list[str]:
-    """Return the links at the ends of the branches that at least one joint moves, in file order; no wheel's rotor."""
-    joints = {joint.find("child").get("link"): joint for joint in root.findall("joint")}  # type: ignore[union-attr]
-    parents = {joint.find("parent").get("link") for joint in joints.values()}  # type: ignore[union-attr]
+    """Return the links at the ends of the branches that at least one joint moves, in file order.
 
-    def moves(link: str | None) -> bool:
-        while link in joints:
-            if joints[link].get("type") != "fixed" and joints[link].find("wheel") is None:
-                return True
-            link = joints[link].find("parent").get("link")  # type: ignore[union-attr]
-        return False
-
+    Neither a wheel's rotor is one nor a frame that only marks a place: of the latter the link that it is fixed to.
+    """
+    joints = [joint for joint in root.findall("joint") if joint.find("site") is None]
+    marks = {_end(joint, "child") for joint in root.findall("joint")} - {_end(joint, "child") for joint in joints}
+    parents = {_end(joint, "parent") for joint in joints}
+    below: dict[str, list[ET.Element]] = {}
+    for joint in joints:
+        below.setdefault(_end(joint, "parent"), []).append(joint)
+    moved, waiting = set(), [(root_link(root), False)]
+    while waiting:
+        link, moves = waiting.pop()
+        if moves:
+            moved.add(link)
+        for joint in below.get(link, ()):
+            turns = joint.get("type") != "fixed" and joint.find("wheel") is None
+            waiting.append((_end(joint, "child"), moves or turns))
     names = [link.get("name", "") for link in root.findall("link")]
-    return [name for name in names if name not in parents and moves(name)]
+    return [name for name in names if name not in parents and name in moved and name not in marks]
+
+
+def _end(joint: ET.Element, role: str) -> str:
+    element = joint.find(role)
+    return "" if element is None else element.get("link", "")
 
 
 @dataclass(frozen=True)

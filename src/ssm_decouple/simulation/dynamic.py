@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.control.schedule import ScheduledLaw
 from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_positive, as_seed
+from ssm_decouple.model.massless import refuse_singular_mass_matrix
 from ssm_decouple.model.plant import Plant
 from ssm_decouple.model.robot import UNLIMITED, Robot
 from ssm_decouple.model.tree import Tree
@@ -214,6 +215,9 @@ class DynamicMotion:
         self.driven = np.ascontiguousarray(self.plant.driven[order], dtype=np.int64)
         there = dict(zip(robot.joint_names, robot.joint_positions(q), strict=True))
         self.start = self.plant.configuration(self.plant.rigid.configuration(there, robot.base_pose(q)))
+        # Joints that follow their commands whatever torque it takes need no inertia: only what is left free does.
+        free, _ = physics.split(self.driven, self.plant.robot.model.nv, settings.servo is None)
+        refuse_singular_mass_matrix(self.plant.robot.model, self.start, self.plant.robot.name, free)
         self.q = self._positions(self.start)
         self.v: Floats = np.zeros(self.plant.robot.model.nv)
         model = self.plant.robot.model

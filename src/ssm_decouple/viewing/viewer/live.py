@@ -424,7 +424,11 @@ def case_of(source: str) -> Case:
         InputError: it is neither.
         ModelError: a robot that cannot be read.
     """
-    if source not in models() and Path(source).suffix.lower() not in (".urdf",) and not _is_robot_toml(source):
+    if (
+        source not in models()
+        and Path(source).suffix.lower() not in (".urdf", ".xml", ".mjcf")
+        and not _is_robot_toml(source)
+    ):
         return load_case(source)
     from ssm_decouple.model.catalogue import load_robot
 
