@@ -19,7 +19,15 @@ from ssm_decouple.model.plant import Plant
 from ssm_decouple.model.robot import UNLIMITED, Robot
 from ssm_decouple.model.tree import Tree
 from ssm_decouple.simulation import physics
-from ssm_decouple.simulation.motion import build_motion, flagged_spans, rotations_to, twist_along
+from ssm_decouple.simulation.motion import (
+    build_motion,
+    flagged_spans,
+    joint_positions,
+    rotations_to,
+    twist_along,
+    wheel_momenta,
+)
+from ssm_decouple.simulation.steps import after_jump, between
 
 Floats = NDArray[np.float64]
 
@@ -275,6 +283,10 @@ class DynamicMotion:
     def _law_configuration(self, positions: Floats) -> Floats:
         return self._with_base(self.law.robot.model, self._law_moved, positions)
 
+    def _law_velocity(self) -> Floats:
+        """Return the velocity of the law's robot (nv,): base twist in base axes, then joint rates."""
+        return np.r_[self.v[:6], self.v[6 + self.driven]]
+
     def correction(self) -> Floats | None:
         """Return the rate b (k,) about the protected directions that takes back what the gyros have told."""
         return -self.settings.feedback_gain * self.measured if self.settings.feedback_gain else None
@@ -283,12 +295,14 @@ class DynamicMotion:
         """Hold commanded joint rates (n,) from t to t_next.
 
         Returns:
-            The configuration of the law's robot (nq,) then, and the integral of the base twist (6,), base axes.
+            The configuration of the law's robot (nq,) then, and the integral of the base twist (2, 6), in base axes
+            and in those of the law's directions.
 
         Raises:
             FloatingPointError: the motion has diverged; the message says when.
         """
         held, before = _holding(self.settings, t, t_next), self.totals[:6].copy()
+        start, first = self._law_configuration(self.q[self.driven]), self._law_velocity()
         held[physics.INERTIAL] = float(self.axes == "inertial")
         bad = physics.advance(
             *self._constants,
@@ -306,7 +320,11 @@ class DynamicMotion:
             raise FloatingPointError(f"{t + bad * held[physics.STEP]:.6g}")
         twist = self.totals[:6] - before
         self._measure(twist, t_next - t)
-        return self._law_configuration(self.q[self.driven]), twist
+        end, dt = self._law_configuration(self.q[self.driven]), t_next - t
+        velocities = np.array([first, self._law_velocity()])
+        if self.settings.servo is None:
+            velocities = after_jump(velocities, rates, twist, dt)
+        return end, np.array([twist, between(self.law, np.array([start, end]), velocities, twist, dt)])
 
     def sample(self) -> None:
         """Remember the state for the record."""
@@ -344,8 +362,14 @@ class DynamicMotion:
             "end_effector_position": points,
             "end_effector_error": np.linalg.norm(motion.target_position.values - points, axis=1),
         }
+        own = np.hstack([velocities[:, :6], velocities[:, 6 + self.driven]])
+        moved = 0.5 * np.diff(time)[:, None] * (own[1:, 6:] + own[:-1, 6:])
+        replaced["joint_positions"] = joint_positions(self.law.robot.model, seen, moved)
+        if self.law.robot.wheel_names:
+            replaced["wheel_momentum"] = wheel_momenta(self.plant.robot.model, self.law.robot.wheel_names, velocities)
         for name, values in replaced.items():
             motion[name].values = values
+        motion["protected_rate"].attrs["long_name"] = "U_c^T (base twist): the truth at the sample"
         names = self.plant.robot.joint_names
         motion = motion.assign_coords(
             hinge=[names[place] for place in self.plant.hinges],

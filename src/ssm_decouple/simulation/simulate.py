@@ -25,7 +25,7 @@ from ssm_decouple.errors import (
     as_triple,
 )
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
-from ssm_decouple.simulation.motion import build_motion, error_of, judge
+from ssm_decouple.simulation.motion import Outcome, build_motion, error_of, judge
 from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted, sample_times
 
 Floats = NDArray[np.float64]
@@ -162,7 +162,7 @@ class _Run:
         samples, n = time.size, law.robot.n_joints
         self.configurations = np.empty((samples, start.size))
         self.configurations[0] = start
-        self.twists = np.zeros((samples, 6))
+        self.twists = np.zeros((2, samples, 6))  # integrals, in base axes and in those of the law's directions
         self.targets = np.empty((samples, law.layout.target_sizes[0]))
         self.values = np.empty((samples, law.size))
         self.rates = self.values[:, 6 : 6 + n]
@@ -176,7 +176,7 @@ class _Run:
         i, time = self.done, self.time
         if i > 0:
             self.configurations[i], moved = self._move(i)
-            self.twists[i] = self.twists[i - 1] + moved
+            self.twists[:, i] = self.twists[:, i - 1] + moved
         self.targets[i], velocity = self.demand.reference(time[i])
         middle = time[i] + self.leads[i]
         previous, pace = self.rates[i - 1] if i else self.at_rest, self.demand.pace(middle)
@@ -198,14 +198,21 @@ class _Run:
     def ended(self, tolerance: float) -> bool:
         """Say whether the end-effector has arrived or has stalled."""
         error = np.linalg.norm(self.errors[: self.done], axis=1)
-        return judge(self.time[: self.done], error, tolerance, 1.0 / self.law.layout.slowest_gain).name != "running"
+        return self._judged(error, tolerance).name != "running"
+
+    def _judged(self, error: Floats, tolerance: float) -> Outcome:
+        way = np.linalg.norm(np.diff(self.targets[: self.done], axis=0), axis=1)
+        target_way = np.r_[0.0, np.cumsum(way)] if way.any() else None
+        return judge(self.time[: self.done], error, tolerance, 1.0 / self.law.layout.slowest_gain, target_way)
 
     def record(self) -> xr.Dataset:
         """Return the motion so far."""
         law, done, time = self.law, self.done, self.time[: self.done]
         record = partial(build_motion, law) if self.dynamic is None else self.dynamic.record
-        motion = record(time, self.configurations[:done], self.values[:done], self.twists[:done], self.targets[:done])
-        outcome = judge(time, error_of(motion), self.settings["arrival_tolerance"], 1.0 / law.layout.slowest_gain)
+        motion = record(
+            time, self.configurations[:done], self.values[:done], self.twists[:, :done], self.targets[:done]
+        )
+        outcome = self._judged(error_of(motion), self.settings["arrival_tolerance"])
         motion.attrs |= {
             "method": "dynamic" if self.dynamic is not None else self.method,
             **self.settings,
