@@ -5,12 +5,14 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ssm_decouple.errors import InputError, ModelError, unknown
+from ssm_decouple.errors import InputError, ModelError, as_path, as_text, unknown
+from ssm_decouple.files import is_file
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.model.urdf import read_urdf
@@ -58,14 +60,17 @@ def find_robot(source: str | Path) -> Path:
 
     Raises:
         ModelError: it is neither.
+        InputError: it is no text and no path.
     """
     catalogue = models()
+    path = as_path("robot", source, f"give a path, or a name of the catalogue ({', '.join(catalogue)})")
     if str(source) in catalogue:
         return catalogue[str(source)]
-    path = Path(source).expanduser()
-    if path.is_file():
+    if is_file(path):
         return path
-    kind = "is a folder, not a URDF file" if path.is_dir() else "is neither a file nor a robot of the catalogue"
+    kind = "is neither a file nor a robot of the catalogue"
+    with suppress(OSError):
+        kind = "is a folder, not a URDF file" if path.is_dir() else kind
     raise ModelError(f"'{source}' {kind} ({', '.join(catalogue)})")
 
 
@@ -94,6 +99,8 @@ def load_robot(source: str | Path, end_effector: str | None = None) -> Robot:
         ModelError: no such robot, not a URDF, impossible to simulate, or no such end-effector; a TOML file with an
             unknown key (the nearest known one is named), a missing one, or an appendage that makes no sense.
     """
+    if end_effector is not None:
+        as_text("end_effector", end_effector, "it is the name of a link or frame, or None")
     found = describe(source)
     text, tool = read_urdf(found.urdf), end_effector or found.end_effector
     return Robot(text, name=found.name, end_effector=tool, appendages=found.appendages)
@@ -164,6 +171,7 @@ def example_robot(path: str) -> Path:
     Raises:
         ModelError: the package is not installed, or has no such file; the URDFs near it are named.
     """
+    as_path("path", path)
     try:
         distribution = metadata.distribution("example-robot-data")
     except metadata.PackageNotFoundError:
