@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ssm_decouple.errors import FileError
@@ -29,6 +29,14 @@ def writable_folder(folder: str | Path) -> Path:
     return path
 
 
+def is_file(path: Path) -> bool:
+    """Say whether a path leads to a file; one that is too long to be a path does not."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 @contextmanager
 def written_whole(path: str | Path) -> Iterator[Path]:
     """Give a temporary name beside `path`; what was written there takes its place only if all went well.
@@ -37,6 +45,8 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         FileError: the place cannot be written.
     """
     final = Path(path)
+    if not final.name:
+        raise FileError(f"cannot write '{final}': it names no file")
     temporary = final.with_name(f".{final.stem}.{os.getpid()}.part{final.suffix}")
     try:
         yield temporary
@@ -44,4 +54,5 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     except OSError as error:
         raise FileError(f"cannot write '{final}': {error.strerror or error}") from error
     finally:
-        temporary.unlink(missing_ok=True)
+        with suppress(OSError):  # a name too long for a file, told above
+            temporary.unlink(missing_ok=True)

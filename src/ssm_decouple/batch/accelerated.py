@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from ssm_decouple.batch.base import Engine, Floats, Judge, Progress, Wanted
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.errors import InputError, as_floats, as_kind, as_whole, shown
+from ssm_decouple.model.robot import UNIT, Robot
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.steps import sample_times
 
@@ -59,10 +59,14 @@ class JaxBatch(Engine):
         chunk: int | None = None,
     ) -> None:
         super().__init__(robot, end_effector)
-        if chunk is not None and not (isinstance(chunk, int) and chunk > 0):
-            raise InputError(f"chunk is {chunk!r}; give a positive whole number, or None for one that suits the device")
         self.device = _device(device)
-        self.chunk: int = chunk or (ON_PROCESSOR if self.device.platform == "cpu" else ON_GPU)
+        usual, needs = (
+            ON_PROCESSOR if self.device.platform == "cpu" else ON_GPU,
+            "give a positive whole number, or None",
+        )
+        self.chunk: int = (
+            usual if chunk is None else as_whole("chunk", chunk, 1, f"{needs} for one that suits the device")
+        )
         self._compiled: dict[tuple[Any, ...], Any] = {}
 
     def __repr__(self) -> str:
@@ -212,8 +216,9 @@ class TracedLaw:
         """Return the momentum matrices (.., rows, n) and the like, base axes, with the names of `Matrices`."""
         from ssm_decouple.batch import functions
 
-        found = functions.matrices(self._arm, _last(joints, "joints"))
-        return functions.Matrices(*(_front(array, array.ndim - joints.ndim + 1) for array in found))
+        columns = _last(joints, "joints", self._law.limits.size)
+        found = functions.matrices(self._arm, columns)
+        return functions.Matrices(*(_front(array, array.ndim - columns.ndim + 1) for array in found))
 
     def command(
         self, joints: Array, target: Array, pose: Array | None = None, gain: Array | float | None = None
@@ -278,20 +283,41 @@ class TracedLaw:
         self, joints: Array, target: Array, pose: Array | None, gain: Array | float | None
     ) -> tuple[functions.Law, list[Array]]:
         """Return the law, and joints, pose and target with the axes of the batch last, and the same in all."""
+        import jax
         import jax.numpy as jnp
 
         place = jnp.zeros(7).at[6].set(1.0) if pose is None else pose
-        arrays = [_last(array, name) for array, name in ((joints, "joints"), (place, "pose"), (target, "target"))]
+        given = ((joints, "joints", self._law.limits.size), (place, "pose", 7), (target, "target", 3))
+        arrays = [_last(array, name, size) for array, name, size in given]
+        if pose is not None:
+            arrays[1] = _unit(arrays[1])
+        if gain is not None and not isinstance(gain, jax.Array) and not np.all(as_floats("gain", gain) > 0.0):
+            raise InputError(f"gain is {shown(gain)}; it must be a positive number")
         batch = jnp.broadcast_shapes(*(array.shape[1:] for array in arrays))
         spread = [jnp.broadcast_to(_aligned(array, len(batch)), (len(array), *batch)) for array in arrays]
         return self._law if gain is None else self._law._replace(gain=gain), spread
 
 
-def _last(array: Any, name: str) -> Array:
-    """Return an array (.., m) as (m, ..)."""
+def _unit(pose: Array) -> Array:
+    """Return poses (7, ..); refused, or NaN where they are traced, if a quaternion is not of unit length."""
+    import jax
     import jax.numpy as jnp
 
-    given = jnp.asarray(array)
+    lengths = jnp.sqrt(jnp.sum(pose[3:] ** 2, axis=0))
+    off = jnp.abs(lengths - 1.0) > UNIT
+    if not isinstance(off, jax.core.Tracer) and bool(jnp.any(off)):
+        raise InputError("a pose has a quaternion that is not of unit length; divide it by its length")
+    return jnp.where(off, jnp.nan, pose)
+
+
+def _last(array: Any, name: str, size: int) -> Array:
+    """Return an array (.., size) as (size, ..)."""
+    import jax
+    import jax.numpy as jnp
+
+    given = jnp.asarray(array if isinstance(array, jax.Array) else as_floats(name, array))
+    if given.ndim == 0 or given.shape[-1] != size:
+        raise InputError(f"{name} have shape {given.shape}; they need (.., {size})")
     if given.dtype != np.float64:
         raise InputError(
             f"{name} are of type {given.dtype}; the law needs 64 bits: jax.config.update('jax_enable_x64', True), or "
@@ -329,7 +355,8 @@ def _device(device: str | jax.Device | None) -> jax.Device:
     except ImportError:
         raise InputError("JaxBatch needs JAX, which is not installed: pip install 'ssm-decouple[jax]'") from None
     if not isinstance(device, str):
-        return jax.devices()[0] if device is None else device
+        mend = "give 'cpu', 'gpu', a device of JAX's, or None"
+        return jax.devices()[0] if device is None else as_kind("device", device, jax.Device, mend)
     try:
         return jax.devices(device)[0]
     except RuntimeError:

@@ -15,7 +15,7 @@ from ssm_decouple.batch import lanes, rows
 from ssm_decouple.batch.base import NO_ROWS, Engine, Floats, Judge, Progress, Wanted
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import as_whole
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 
@@ -46,9 +46,8 @@ class Batch(Engine):
 
     def __init__(self, robot: Robot, end_effector: str | None = None, threads: int | None = None) -> None:
         super().__init__(robot, end_effector)
-        if threads is not None and not (isinstance(threads, int) and threads > 0):
-            raise InputError(f"threads is {threads!r}; give a positive whole number, or None for one a processor")
-        self.threads: int = threads or os.cpu_count() or 1
+        needs = "give a positive whole number, or None for one a processor"
+        self.threads: int = (os.cpu_count() or 1) if threads is None else as_whole("threads", threads, 1, needs)
 
     def __repr__(self) -> str:
         return f"Batch({self.robot!r}, end_effector={self.end_effector!r}, threads={self.threads})"

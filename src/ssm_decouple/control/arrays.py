@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.errors import InputError, as_floats
+from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_positive
 
 Floats = NDArray[np.float64]
 
@@ -93,11 +93,8 @@ def selective_rates(
             f"rate_limits are {limits.tolist()} and joint_weights {weights.tolist()}; all must be above zero, the "
             "weights finite"
         )
-    if not (damping >= 0.0 and damping_threshold > 0.0 and np.isfinite(damping) and np.isfinite(damping_threshold)):
-        raise InputError(
-            f"damping is {damping} and damping_threshold {damping_threshold}; they must be finite, the first zero or "
-            "more and the second above zero"
-        )
+    damping = as_not_negative("damping", damping)
+    damping_threshold = as_positive("damping_threshold", damping_threshold)
     rates = _output(out, (n,))
     scale = 1.0 / np.sqrt(weights)
     if kernel.rates_of(rows, task, velocity, wanted, limits, scale, damping, damping_threshold, rates) != kernel.OK:
@@ -127,7 +124,7 @@ def _spread(name: str, values: ArrayLike, size: int) -> Floats:
 def _output(out: Floats | None, shape: tuple[int, ...]) -> Floats:
     if out is None:
         return np.empty(shape)
-    fit = isinstance(out, np.ndarray) and out.dtype == np.float64 and out.shape == shape
+    fit = type(out) is np.ndarray and out.dtype == np.float64 and out.shape == shape
     if not (fit and out.flags.c_contiguous and out.flags.writeable):
         raise InputError(f"out must be a writable, contiguous float64 array {shape}")
     return out

@@ -12,7 +12,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from ssm_decouple.errors import InputError, ModelError, as_not_negative, as_positive
+from ssm_decouple.errors import InputError, ModelError, as_items, as_not_negative, as_positive, shown
 from ssm_decouple.model.robot import Robot
 
 Floats = NDArray[np.float64]
@@ -49,12 +49,22 @@ class Clearance:
     ignored: Sequence[Pair] = ()
 
     def __post_init__(self) -> None:
-        as_not_negative("distance", self.distance)
-        if self.horizon is not None and not as_positive("horizon", self.horizon) > self.distance:
-            raise InputError(f"horizon is {self.horizon} m; it must be beyond the distance {self.distance} m")
-        for pair in (*(self.pairs or ()), *self.ignored):
-            if isinstance(pair, str) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
-                raise InputError(f"{pair!r} is no pair of link names, such as ('bus', 'link_3')")
+        object.__setattr__(self, "distance", as_not_negative("distance", self.distance))
+        if self.horizon is not None:
+            object.__setattr__(self, "horizon", as_positive("horizon", self.horizon))
+            if not self.horizon > self.distance:
+                raise InputError(f"horizon is {self.horizon} m; it must be beyond the distance {self.distance} m")
+        object.__setattr__(self, "pairs", None if self.pairs is None else _pairs("pairs", self.pairs))
+        object.__setattr__(self, "ignored", _pairs("ignored", self.ignored))
+
+
+def _pairs(name: str, given: Sequence[Pair]) -> tuple[Pair, ...]:
+    pairs = as_items(name, given, "it is a list of pairs of link names, such as [('bus', 'link_3')]")
+    for pair in pairs:
+        two = isinstance(pair, list | tuple) and len(pair) == 2
+        if not two or not all(isinstance(link, str) for link in pair):
+            raise InputError(f"{shown(pair)} is no pair of link names, such as ('bus', 'link_3')")
+    return tuple((first, second) for first, second in pairs)
 
 
 class Distances:

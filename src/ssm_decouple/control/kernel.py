@@ -48,15 +48,18 @@ _MATRIX, _ROWS, _VECTOR = "float64[::1, :]", "float64[:, ::1]", "float64[::1]"
 # Pinocchio's matrices are stored by columns, everything else by rows.
 _FROM_PINOCCHIO = f"{_MATRIX}, {_MATRIX}, {_ROWS}"
 _CONSTANTS = f"{_ROWS}, {_ROWS}, {_ROWS}, {_VECTOR}"
-SELECTIVE_COMMAND = f"int64({_FROM_PINOCCHIO}, {_CONSTANTS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR})"
+SELECTIVE_COMMAND = f"int64({_FROM_PINOCCHIO}, {_CONSTANTS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR})"
 
 # What selective_command returns.
 OK = 0
 NOT_FINITE = 1
 NO_INERTIA = 2
-NOT_UNIT_QUATERNION = 3
+NOT_UNIT = 3
 WRONG_SIZE = 4
 NOT_A_TARGET = 5
+OTHER_MASS = 6
+
+UNIT = 1e-6  # how far a length of 1 may be off
 
 # Where the results stand in `out`: first Pinocchio's velocity v, base twist (6: linear, angular, base axes) and joint
 # rates (n), then the following, counted from 6 + n.
@@ -541,8 +544,8 @@ def add_matrices_at(
     n = columns.shape[1]
     mass = parameters[MASS]
     m_squared = A_g[0, 0] ** 2 + A_g[1, 0] ** 2 + A_g[2, 0] ** 2
-    if abs(m_squared - mass * mass) > 1e-6 * mass * mass:
-        return NOT_UNIT_QUATERNION
+    if abs(m_squared - mass * mass) > 1e-5 * mass * mass:
+        return OTHER_MASS
     if base_twist_map(A_g, J_base) == 0.0:
         return NO_INERTIA
     held = placements[int(parameters[TOOL_JOINT])]
@@ -1035,6 +1038,19 @@ def wrong_size(n: int, parameters: Floats, targets: Floats, velocities: Floats, 
     return vectors or previous.shape[0] != n or out.shape[0] != size
 
 
+@compiled_for("boolean(float64[::1], float64[:, ::1])")
+def off_unit(q: Floats, columns: Floats) -> bool:
+    """Say whether the quaternion of q, or the cosine and sine of a continuous joint, is not of unit length."""
+    if not abs(np.sqrt(q[3] ** 2 + q[4] ** 2 + q[5] ** 2 + q[6] ** 2) - 1.0) <= UNIT:
+        return True
+    for j in range(columns.shape[1]):
+        if columns[CONTINUOUS, j] > 0.0:
+            place = int(columns[PLACE, j])
+            if not abs(np.sqrt(q[place] ** 2 + q[place + 1] ** 2) - 1.0) <= UNIT:
+                return True
+    return False
+
+
 @compiled_for(SELECTIVE_COMMAND)
 def selective_command(
     A_g: Floats,
@@ -1048,6 +1064,7 @@ def selective_command(
     velocities: Floats,
     previous: Floats,
     out: Floats,
+    q: Floats,
 ) -> int:
     """Write q_dot = (J_gt N_sub)^+ v_cmd, or what the tasks make of it, and what follows into `out`.
 
@@ -1065,14 +1082,18 @@ def selective_command(
         velocities: Theirs, m/s or rad/s, a number a task row, of a direction three.
         previous: The rates commanded before (n,); read only where RATE_STEP limits something.
         out: (6 + n + ERRORS + task rows + 2 levels,), overwritten.
+        q: The configuration (nq,) that Pinocchio was given, whose length it has looked at.
 
     Returns:
-        OK, NOT_FINITE (in the configuration or the targets), NO_INERTIA (H_ww is singular), NOT_UNIT_QUATERNION,
-        WRONG_SIZE (of targets, of `previous` or of `out`) or NOT_A_TARGET (no rotation or no direction).
+        OK, NOT_FINITE (in the configuration or the targets), NO_INERTIA (H_ww is singular), NOT_UNIT (the quaternion,
+        or the cosine and sine of a joint), WRONG_SIZE (of targets, of `previous` or of `out`), NOT_A_TARGET (no
+        rotation or no direction) or OTHER_MASS (A_g is not of the robot's mass).
     """
     n, m = columns.shape[1], int(parameters[TASK_ROWS])
     if wrong_size(n, parameters, targets, velocities, previous, out):
         return WRONG_SIZE
+    if off_unit(q, columns):
+        return NOT_UNIT
     # Two allocations for all scratch: each costs as much as a reflection.
     work, small = np.empty((J_TASK + 22 + 2 * m, n)), np.empty((max(2 * m + 7, 11) + 1, 6 + m))
     drift = np.zeros((J_TASK + m, 1))
@@ -1190,17 +1211,6 @@ def read_joints(q: Floats, columns: Floats) -> None:
             columns[JOINT_POSITION, j] = np.arctan2(q[place + 1], q[place])
 
 
-@compiled_for("boolean(float64[::1], int64[::1])")
-def off_circle(q: Floats, starts: Floats) -> bool:
-    """Say whether a cosine and sine in q, at one of the given places, are not of unit length."""
-    for i in range(starts.shape[0]):
-        start = starts[i]
-        square = q[start] ** 2 + q[start + 1] ** 2
-        if not abs(square - 1.0) < 1e-6:
-            return True
-    return False
-
-
 @compiled
 def change_of(rates: Floats, before: Floats) -> float:
     """Return how far rates (n,) differ from those before, relative to the largest, and remember them there."""
@@ -1312,6 +1322,8 @@ def pose_command(
     """Do what `selective_command` does, and write what it has solved into the other arrays, by `pose_rows`."""
     if wrong_size(columns.shape[1], parameters, targets, velocities, previous, out):
         return WRONG_SIZE
+    if off_unit(q, columns):
+        return NOT_UNIT
     read_joints(q, columns)
     matrices[:] = 0.0
     drift[:] = 0.0

@@ -13,10 +13,21 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.task import Layout, PositionTask, Task, checked_tasks
-from ssm_decouple.errors import DecoupleWarning, InputError, as_floats, as_not_negative, as_number, as_positive
-from ssm_decouple.model.robot import Robot, per_joint
+from ssm_decouple.errors import (
+    DecoupleWarning,
+    InputError,
+    as_floats,
+    as_kind,
+    as_not_negative,
+    as_number,
+    as_positive,
+    as_whole,
+    shown,
+)
+from ssm_decouple.model.robot import Robot, checked_robot, per_joint, warn_of_degrees
 from ssm_decouple.momentum.flow import munthe_kaas, places_on_hold, quadrature_along, ways_to_nodes
-from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.momentum.protection import Protection, checked_protection
+from ssm_decouple.settled import Settled
 
 if TYPE_CHECKING:
     from ssm_decouple.control.limits import LimitedRates, LimitedStep, Limits
@@ -31,7 +42,9 @@ GAUSS: dict[int, tuple[tuple[float, float], ...]] = {
     3: ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 4 / 9), (0.5 + np.sqrt(15) / 10, 5 / 18)),
 }
 # One look-up instead of two, in every step.
-centroidal_map, selective_command = pin.computeCentroidalMap, kernel.selective_command
+centroidal_map, selective_command, array = pin.computeCentroidalMap, kernel.selective_command, np.ndarray
+
+FASTEST = 2 * np.pi  # rad/s: above it a joint's rate limit looks like degrees
 
 CLIMB_STEP = 1e-6  # rad or m, of the finite differences
 CLIMB_SHARE = 0.25  # of the rate limits
@@ -220,7 +233,7 @@ class LostDirection:
         }
 
 
-class SelectiveLaw:
+class SelectiveLaw(Settled):
     """The paper's law: q_dot = (J_gt N_sub)^+ (x_dot_des + k_p (x_des - x)), scaled as a whole to the rate limits.
 
     Equations 9 and 17; the paper gives the limits and leaves open how they are kept.
@@ -245,7 +258,8 @@ class SelectiveLaw:
     still. The law takes that off what it asks of the joints: the protected rate stays zero as long as the joints can
     take the momentum up, and the tasks are met beside it.
 
-    A law holds Pinocchio's scratch memory: use one law in one thread.
+    A law holds Pinocchio's scratch memory: use one law in one thread. Its settings are read when it is made and cannot
+    be assigned afterwards, but for `momentum`, which acts.
 
     Args:
         robot: The robot.
@@ -274,13 +288,16 @@ class SelectiveLaw:
     Attributes:
         size: Length of the array that `evaluate` fills.
         joint_weights: (n,), as given or by default.
-        limited: Of a law with `limits`, what they did to the last command.
         tasks: The tasks, a tuple.
         layout: Where their rows and targets stand.
 
     Raises:
         InputError: a number that is not positive (damping may be 0), a wrong shape, a missing sample time, a robot
             without joints, a task that the robot cannot do, or a protection that takes all freedoms of the tasks.
+        ModelError: `robot.model` was changed after the robot was made.
+
+    Warns:
+        DecoupleWarning: a rate limit that looks like degrees.
     """
 
     def __init__(
@@ -299,19 +316,19 @@ class SelectiveLaw:
         momentum: ArrayLike | None = None,
         limits: Limits | None = None,
     ) -> None:
-        n = robot.n_joints
+        n = checked_robot(robot).n_joints
         if n == 0:
             raise InputError(f"'{robot.name}' has no joints to command; put an arm on it with compose(..)")
-        if not isinstance(protection, Protection):
-            raise InputError(f"protection is {protection!r}; give a Protection, such as Protection('yaw')")
-        if not (isinstance(hold_nodes, int) and hold_nodes in GAUSS):
+        robot.refuse_changed_model()
+        hold_nodes = as_whole("hold_nodes", hold_nodes, 0, "it is 0 (at the sample), 1, 2 or 3")
+        if hold_nodes not in GAUSS:
             raise InputError(f"hold_nodes is {hold_nodes}; it is 0 (at the sample), 1, 2 or 3")
         if sample_time is None and (hold_nodes or acceleration_limit is not None or limits is not None):
             raise InputError(
                 "hold_nodes, acceleration_limit and limits need the sample_time, s, for which a command is held"
             )
         self.robot = robot
-        self.protection = protection
+        self.protection = checked_protection(protection)
         self.gain = as_positive("gain", gain)
         self.damping = as_not_negative("damping", damping)
         self.damping_threshold = as_positive("damping_threshold", damping_threshold)
@@ -320,6 +337,8 @@ class SelectiveLaw:
         self.rate_limits: Floats = per_joint(
             robot, "rate_limit", robot.rate_limits if rate_limit is None else rate_limit
         )
+        if rate_limit is not None:
+            warn_of_degrees(robot, "rate_limit", self.rate_limits, FASTEST, "rad/s")
         self.acceleration_limits: Floats | None = None
         if acceleration_limit is not None:
             self.acceleration_limits = per_joint(robot, "acceleration_limit", acceleration_limit)
@@ -331,8 +350,8 @@ class SelectiveLaw:
         self.tasks = (PositionTask(),) if tasks is None else checked_tasks(robot, tasks)
         self.layout = Layout(robot, self.tasks, self.gain)
         self.size: int = 6 + n + kernel.ERRORS + self.layout.size + 2 * len(self.layout.level_rows)
-        self.limits = limits
-        self.limited: LimitedRates | None = None
+        self.limits = None if limits is None else _checked_limits(limits)
+        self._limited: LimitedRates | None = None
         self._step: LimitedStep | None = None
         self._prepare()
         self._set_momentum(momentum)
@@ -340,6 +359,11 @@ class SelectiveLaw:
             self._prepare_limits(limits)
         if tasks is not None:
             self._refuse_what_nothing_is_left_for()
+
+    @property
+    def limited(self) -> LimitedRates | None:
+        """Of a law with `limits`, what they did to the last command."""
+        return self._limited
 
     @property
     def directions(self) -> tuple[Floats, str]:
@@ -370,8 +394,8 @@ class SelectiveLaw:
         values = np.zeros(6) if momentum is None else as_floats("momentum", momentum)
         if values.shape != (6,) or not np.all(np.isfinite(values)):
             raise InputError(
-                f"momentum is {values.tolist()}; it needs 6 finite numbers, linear and angular about the centre of "
-                "mass, inertial axes"
+                f"momentum is {shown(values.tolist())}; it needs 6 finite numbers, linear and angular about the centre "
+                "of mass, inertial axes"
             )
         self._prepared[3][3][kernel.MOMENTUM :] = values
 
@@ -455,15 +479,11 @@ class SelectiveLaw:
         data = model.createData()
         # Live views into the Pinocchio data, fetched once: each fetch would cost as much as a tenth of the step.
         views = (data.Ag, data.J, _placements(data, model.njoints))
-        constants = (U_c, layout.table, columns, parameters)
+        constants = (U_c, layout.table.copy(), columns, parameters)
         self._prepared = (model, data, views, constants, (*views, *constants))
         self._reads_joints = bool(np.any(layout.table[:, kernel.KIND] == kernel.JOINTS))
         self._flat = layout.plain
         self._at_rest: Floats = np.zeros(layout.target_sizes[1])  # writable, as the kernel wants it; never written
-        # Where continuous joints keep cosine and sine: the matrices do not tell whether these fit.
-        circles = np.array([joint.idx_q for joint in model.joints[2:] if joint.nq == 2], dtype=np.int64)
-        self._circles = circles if circles.size else None
-        self._looks_at_q = self._reads_joints or self._circles is not None
         self._n, self._k = n, self.protection.k
         self._no_rates: Floats = np.zeros(n)
         self._any_target: Floats = layout.any_target()
@@ -587,7 +607,7 @@ class SelectiveLaw:
         Raises:
             InputError: as for the call.
         """
-        if protected_rate is not None or pace != 1.0:
+        if protected_rate is not None or type(pace) is not float or pace != 1.0:
             _, _, _, (*_, parameters), _ = self._prepared
             usual = parameters.copy()
             parameters[kernel.PACE : kernel.MOMENTUM] = self._asked(protected_rate, pace)
@@ -607,14 +627,13 @@ class SelectiveLaw:
             target_velocity = velocities
         model, data, _, constants, fixed = self._prepared
         try:  # arrays of the right kind are not looked at twice
+            if not (type(q) is type(target) is type(target_velocity) is type(previous_rates) is array):
+                raise TypeError  # a subclass: a masked array would pass as what lies under its mask
             centroidal_map(model, data, q)
-            if self._looks_at_q:
-                if self._circles is not None and kernel.off_circle(q, self._circles):  # type: ignore[arg-type]
-                    self.robot.checked(q)
-                if self._reads_joints:
-                    kernel.read_joints(q, constants[2])  # type: ignore[arg-type]
-            status = (
-                selective_command(*fixed, target, target_velocity, previous_rates, out)  # type: ignore[arg-type]
+            if self._reads_joints:
+                kernel.read_joints(q, constants[2])
+            status = (  # a q that Pinocchio reads in its own way, such as one of another byte order, does not fit here
+                selective_command(*fixed, target, target_velocity, previous_rates, out, q)
                 if self._step is None
                 else self._limited_command(q, target, target_velocity, previous_rates, out)
             )
@@ -626,7 +645,7 @@ class SelectiveLaw:
             kernel.read_joints(q, constants[2])
             out = self._checked_out(out)
             status = (
-                kernel.selective_command(*fixed, target, target_velocity, previous_rates, out)
+                kernel.selective_command(*fixed, target, target_velocity, previous_rates, out, q)
                 if self._step is None
                 else self._limited_command(q, target, target_velocity, previous_rates, out)
             )
@@ -666,17 +685,17 @@ class SelectiveLaw:
         ]
         if goal is not None:
             levels = [(np.eye(n), goal if scale is None else goal / scale, 0.0)]
-        self.limited = self._step(
+        self._limited = self._step(
             positions, previous, plain, rows[:k], sides[:k], levels, apart, distances, float(sides[-1])
         )
-        found = self.limited.joint_rates
+        found = self._limited.joint_rates
         if found is plain:
             return
         if scale is not None:  # take out what the rounding of the scaling leaves in the protected rows
             J_sub = rows[:k] / scale
-            found = found - np.linalg.pinv(rows[:k]) @ (J_sub @ (scale * found) - self.limited.share * sides[:k])
+            found = found - np.linalg.pinv(rows[:k]) @ (J_sub @ (scale * found) - self._limited.share * sides[:k])
         kernel.take_rates(self._matrices, self._drift, U_c, columns, parameters, found, out)
-        results[kernel.EXCESS], results[kernel.LIMITED] = self.limited.excess, self.limited.count
+        results[kernel.EXCESS], results[kernel.LIMITED] = self._limited.excess, self._limited.count
 
     def check_start(self, q: ArrayLike) -> None:
         """Look at a start configuration before a motion; a law without `limits` has nothing to say.
@@ -708,8 +727,16 @@ class SelectiveLaw:
         """Return the base twist (6,), base axes, that joint rates (n,) and the momentum on board cause at q.
 
         Without momentum it is `Coupling.base_twist`, but quick.
+
+        Raises:
+            InputError: as for the call.
         """
-        model, data, (A_g, *_), (*_, parameters), _ = self._prepared
+        model, data, (A_g, *_), (_, _, columns, parameters), _ = self._prepared
+        plain = type(q) is array and q.dtype == np.float64 and q.shape == (model.nq,) and q.flags.carray
+        if not plain or kernel.off_unit(q, columns):
+            q = self.robot.checked(q)
+        if not (type(joint_rates) is array and joint_rates.dtype == np.float64 and joint_rates.shape == (self._n,)):
+            joint_rates = self._checked_rates(joint_rates)
         pin.computeCentroidalMap(model, data, q)
         kernel.base_twist_map(A_g, self._J_base)
         twist = self._J_base @ joint_rates
@@ -888,7 +915,7 @@ class SelectiveLaw:
             rate = as_floats("protected_rate", protected_rate)
             if rate.shape != (self._k,) or not np.all(np.isfinite(rate)):
                 raise InputError(
-                    f"protected_rate is {rate.tolist()}; it needs {self._k} finite numbers, one a column of U_c"
+                    f"protected_rate is {shown(rate.tolist())}; it needs {self._k} finite numbers, one a column of U_c"
                 )
             asked[1 : 1 + self._k] = rate
         return asked
@@ -900,7 +927,7 @@ class SelectiveLaw:
         return values
 
     def _checked_out(self, out: Floats) -> Floats:
-        fit = isinstance(out, np.ndarray) and out.dtype == np.float64 and out.shape == (self.size,)
+        fit = type(out) is np.ndarray and out.dtype == np.float64 and out.shape == (self.size,)
         if not (fit and out.flags.c_contiguous and out.flags.writeable):
             raise InputError(f"out must be a writable, contiguous float64 array ({self.size},), law.size long")
         return out
@@ -913,13 +940,13 @@ class SelectiveLaw:
         vectors = self._flat_vectors(target, target_velocity)
         for name, value in zip(("target", "target_velocity"), vectors, strict=True):
             if not np.all(np.isfinite(value)):
-                raise InputError(f"{name} is not finite: {np.asarray(value).tolist()}")
+                raise InputError(f"{name} is not finite: {shown(value.tolist())}")
         self._checked_out(out)
         if status == kernel.NOT_A_TARGET:
             raise InputError(self.layout.strange_target(np.asarray(target)))
         why = {
             kernel.NO_INERTIA: "the whole robot's inertia H_ww is singular",
-            kernel.NOT_UNIT_QUATERNION: "the base quaternion is not of unit length",
+            kernel.OTHER_MASS: f"robot.model does not weigh {self.robot.mass:g} kg: it was changed after it was loaded",
         }.get(status, "its numbers overflow")
         raise InputError(f"no command at this configuration of '{self.robot.name}': {why}")
 
@@ -954,6 +981,12 @@ def _placements(data: pin.Data, joints: int) -> Floats:
         if addresses != [start + i * width, start + i * width + 9 * first.itemsize]:
             raise RuntimeError("this Pinocchio does not keep its placements one after the other")
     return np.lib.stride_tricks.as_strided(first, (joints, 12), (width, first.itemsize))
+
+
+def _checked_limits(limits: Limits) -> Limits:
+    from ssm_decouple.control.limits import Limits
+
+    return as_kind("limits", limits, Limits, "give Limits, such as Limits(braking=0.8), or None")
 
 
 def _vector(name: str, value: ArrayLike) -> Floats:

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import limits_kernel as kernel
 from ssm_decouple.control.collision import Clearance
-from ssm_decouple.errors import InputError, as_floats, as_positive
+from ssm_decouple.errors import InputError, as_floats, as_kind, as_positive, shown
 from ssm_decouple.model.robot import Robot, per_joint
 
 Floats = NDArray[np.float64]
@@ -50,12 +50,20 @@ class Limits:
     clearance: Clearance | None = None
 
     def __post_init__(self) -> None:
-        if not as_positive("braking", self.braking) < 1.0:
+        object.__setattr__(self, "braking", as_positive("braking", self.braking))
+        if not self.braking < 1.0:
             raise InputError(
                 f"braking is {self.braking}; it is a share below 1 of the acceleration limits, such as 0.8"
             )
         if not (self.clearance is None or isinstance(self.clearance, Clearance)):
-            raise InputError(f"clearance is {self.clearance!r}; give a Clearance, such as Clearance(0.05)")
+            raise InputError(f"clearance is {shown(self.clearance)}; give a Clearance, such as Clearance(0.05)")
+        if self.position is not None:
+            position = as_floats("position limits", self.position)
+            if position.ndim != 2:
+                raise InputError(
+                    f"position limits have shape {position.shape}; they need (n, 2): lower and upper, a row a joint"
+                )
+            object.__setattr__(self, "position", tuple(map(tuple, position.tolist())))
 
     def describe(self, robot: Robot) -> dict[str, Any]:
         """Return them in plain types, for a record."""
@@ -70,7 +78,7 @@ class Limits:
         """
         if self.position is None:
             return robot.position_limits.copy()
-        limits, n = as_floats("position limits", self.position), robot.n_joints
+        limits, n = np.array(self.position, dtype=float), robot.n_joints
         if limits.shape == (2, n) and n != 2:
             limits = limits.T
         if limits.shape != (n, 2):
@@ -242,8 +250,7 @@ class LimitedStep:
         sample_time: float,
     ) -> None:
         n = robot.n_joints
-        if not isinstance(limits, Limits):
-            raise InputError(f"limits is {limits!r}; give Limits, such as Limits(braking=0.8)")
+        as_kind("limits", limits, Limits, "give Limits, such as Limits(braking=0.8)")
         position = limits.positions(robot)
         columns = np.empty((kernel.COLUMNS_SIZE, n))
         columns[kernel.LOWER], columns[kernel.UPPER] = position[:, 0], position[:, 1]

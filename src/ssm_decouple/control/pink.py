@@ -13,7 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError
-from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.momentum.protection import Protection, checked_protection
 
 try:
     from pink.tasks import Task
@@ -53,7 +53,7 @@ class ProtectedRate(Task):  # type: ignore[misc]
     """
 
     def __init__(self, protection: Protection) -> None:
-        if protection.k == 0:
+        if checked_protection(protection).k == 0:
             raise InputError("the protection has no direction, which is no constraint: leave it out")
         super().__init__(cost=np.ones(protection.k))
         self.protection = protection

@@ -6,12 +6,14 @@ import dataclasses
 import math
 import tomllib
 import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, unknown
+from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, as_path, as_text, unknown
+from ssm_decouple.files import is_file
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.formats import read_robot
 from ssm_decouple.model.massless import massless_root
@@ -60,14 +62,17 @@ def find_robot(source: str | Path) -> Path:
 
     Raises:
         ModelError: it is neither.
+        InputError: it is no text and no path.
     """
     catalogue = models()
+    path = as_path("robot", source, f"give a path, or a name of the catalogue ({', '.join(catalogue)})")
     if str(source) in catalogue:
         return catalogue[str(source)]
-    path = Path(source).expanduser()
-    if path.is_file():
+    if is_file(path):
         return path
-    kind = "is a folder, not a URDF file" if path.is_dir() else "is neither a file nor a robot of the catalogue"
+    kind = "is neither a file nor a robot of the catalogue"
+    with suppress(OSError):
+        kind = "is a folder, not a URDF file" if path.is_dir() else kind
     raise ModelError(f"'{source}' {kind} ({', '.join(catalogue)})")
 
 
@@ -96,6 +101,8 @@ def load_robot(source: str | Path, end_effector: str | None = None) -> Robot:
         ModelError: no such robot, not a URDF, impossible to simulate, or no such end-effector; a TOML file with an
             unknown key (the nearest known one is named), a missing one, or an appendage that makes no sense.
     """
+    if end_effector is not None:
+        as_text("end_effector", end_effector, "it is the name of a link or frame, or None")
     found = describe(source)
     text, tool = read_robot(found.urdf), end_effector or found.end_effector
     robot = Robot(text, name=found.name, end_effector=tool, appendages=found.appendages)
@@ -169,6 +176,7 @@ def example_robot(path: str) -> Path:
     Raises:
         ModelError: the package is not installed, or has no such file; the URDFs near it are named.
     """
+    as_path("path", path)
     try:
         distribution = metadata.distribution("example-robot-data")
     except metadata.PackageNotFoundError:

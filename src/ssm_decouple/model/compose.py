@@ -10,7 +10,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from ssm_decouple.errors import ModelError, as_floats
+from ssm_decouple.errors import ModelError, as_floats, as_kind, as_text
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.catalogue import describe
 from ssm_decouple.model.formats import read_robot
@@ -52,6 +52,10 @@ def compose(
             appendages (they belong on the root link of the whole), or the whole is impossible.
         InputError: the mount is not a pose.
     """
+    for word, value in (("mount_link", mount_link), ("end_effector", end_effector), ("name", name)):
+        if value is not None:
+            as_text(word, value)
+    as_kind("prefix", prefix, str, "it is a text such as 'left_'")
     (bus_text, bus_name, _, appendages), (arm_text, arm_name, known_tool, lost) = _parts(bus), _parts(arm)
     if lost:
         raise ModelError(

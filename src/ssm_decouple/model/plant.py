@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.errors import DecoupleWarning, InputError, as_floats
 from ssm_decouple.model.appendage import Appendage, flexible_urdf
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.model.urdf import parse_urdf
+from ssm_decouple.settled import fixed_array
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
@@ -51,7 +52,7 @@ class Plant:
         Raises:
             ModelError: the appendages do not fit the robot, as `Robot` says when it is given them.
         """
-        whole, appendages = robot, robot.appendages
+        whole, appendages = robot, checked_robot(robot).appendages
         if appendages:
             root = flexible_urdf(parse_urdf(robot.urdf, robot.name), appendages)
             with warnings.catch_warnings():
@@ -68,10 +69,10 @@ class Plant:
         return cls(
             robot=whole,
             rigid=robot,
-            driven=np.array([whole.joint_index(name) for name in robot.joint_names], dtype=np.intp),
-            hinges=np.array(hinges, dtype=np.intp),
-            stiffness=stiffness,
-            damping=damping,
+            driven=fixed_array(np.array([whole.joint_index(name) for name in robot.joint_names], dtype=np.intp)),
+            hinges=fixed_array(np.array(hinges, dtype=np.intp)),
+            stiffness=fixed_array(stiffness),
+            damping=fixed_array(damping),
             appendages=appendages,
         )
 

@@ -12,12 +12,23 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, as_floats
+from ssm_decouple.errors import (
+    DecoupleWarning,
+    InputError,
+    ModelError,
+    as_floats,
+    as_kind,
+    as_number,
+    as_text,
+    as_whole,
+    shown,
+)
 from ssm_decouple.model.appendage import Appendage, Modes, checked_appendages, inspect_remaining_bus
 from ssm_decouple.model.locked import locked_urdf
 from ssm_decouple.model.payload import loaded_urdf, payload_body
 from ssm_decouple.model.urdf import inspect_urdf, parse_urdf, root_link, tip_links
 from ssm_decouple.model.wheels import Wheel, wheel_axes, wheeled_urdf
+from ssm_decouple.settled import Settled, fixed_array
 
 if TYPE_CHECKING:
     from ssm_decouple.model.report import Report
@@ -25,14 +36,21 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 UNLIMITED = 1e300  # Pinocchio writes the largest double where a URDF gives no limit
+UNIT = 1e-6  # how far the length of a quaternion may be off, as in the law's kernel
+FARTHEST = 4 * np.pi  # rad: beyond it the position of a joint looks like degrees
 
 
-class Robot:
+class Robot(Settled):
     """A spacecraft with arms, free to float: URDF text read by Pinocchio with a free-flyer root.
 
     `model` is the Pinocchio model and every configuration q is an ordinary Pinocchio configuration, so that any
     Pinocchio function works on them. Velocities are v = [base linear; base angular; joint rates], the base twist in
     base axes.
+
+    What is read of the URDF stays as it is. `model` is Pinocchio's own and can be changed, but the other attributes,
+    the URDF and so the record of a motion would not follow: a law and a simulation refuse a model whose bodies or
+    placements were changed, and limits changed in it do nothing. Change the URDF, or use `with_payload`, `with_locked`
+    and the like.
 
     Args:
         urdf: URDF text.
@@ -66,7 +84,8 @@ class Robot:
     def __init__(
         self, urdf: str, *, name: str, end_effector: str | None = None, appendages: Iterable[Appendage] = ()
     ) -> None:
-        root = parse_urdf(urdf, name)
+        as_text("name", name)
+        root = parse_urdf(as_text("urdf", urdf, "give the text of a URDF; load_robot(..) takes a path"), name)
         findings = inspect_urdf(root)
         impossible = [finding for finding in findings if finding.level == "impossible"]
         if impossible:
@@ -96,9 +115,10 @@ class Robot:
         self.end_effector = self._choose_end_effector(end_effector, tip_links(root), root_link(root))
         self.end_effector_id: int = self.frame_id(self.end_effector)
         rates = np.array(self.model.velocityLimit[6:])
-        self.rate_limits: Floats = np.where((rates > 0) & (rates < UNLIMITED), rates, np.inf)
+        self.rate_limits: Floats = fixed_array(np.where((rates > 0) & (rates < UNLIMITED), rates, np.inf))
         self.position_limits: Floats = self._read_position_limits()
         self._refuse_singular_inertia()
+        self._bodies = _bodies_of(self.model)
         self.appendages: tuple[Appendage, ...] = self._fitting(appendages)
 
     def with_appendages(self, appendages: Iterable[Appendage]) -> Robot:
@@ -113,7 +133,7 @@ class Robot:
         """
         robot = copy.copy(self)
         robot._data = self.model.createData()  # the model is shared, what is computed on it is not
-        robot.appendages = robot._fitting(appendages)
+        robot.__dict__["appendages"] = robot._fitting(appendages)
         return robot
 
     def with_payload(
@@ -135,6 +155,8 @@ class Robot:
             ModelError: no body has such an inertia; the message gives its principal moments.
         """
         body = payload_body(mass, centre_of_mass, inertia)
+        if frame is not None:
+            as_text("frame", frame, "it is the link, or the joint, that holds the payload")
         root = parse_urdf(self.urdf, self.name)
         try:
             whole, payload = loaded_urdf(root, body, self.end_effector if frame is None else frame)
@@ -180,6 +202,7 @@ class Robot:
             whole = locked_urdf(parse_urdf(self.urdf, self.name), joints, self.joint_names)
         except InputError as error:
             raise InputError(f"robot '{self.name}': {error}") from error
+        self._warn_of_degrees(joints)
         listed = ", ".join(joints) if len(joints) < 4 else f"{len(joints)} joints"
         return self._rebuilt(whole, f"{self.name}, {listed} locked" if joints else self.name)
 
@@ -215,7 +238,7 @@ class Robot:
                 f"'{self.name}' has no appendage and so no modes; give it some with robot.with_appendages([..]), or "
                 "load a TOML robot such as 'ets_vii_flexible'"
             )
-        return Modes.of(self.appendages, per_appendage)
+        return Modes.of(self.appendages, as_whole("per_appendage", per_appendage))
 
     def _choose_end_effector(self, wanted: str | None, tips: list[str], root: str) -> str:
         frames = self.link_names
@@ -227,7 +250,7 @@ class Robot:
                     f"robot '{self.name}' has {len(tips)} tips: name one as end_effector: {', '.join(tips)}"
                 )
             return tips[0] if tips else root
-        if not self.model.existFrame(wanted):
+        if not self.model.existFrame(as_text("end_effector", wanted)):
             raise ModelError(
                 f"robot '{self.name}' has no frame '{wanted}' for its end-effector; it has {', '.join(frames)}"
             )
@@ -238,10 +261,15 @@ class Robot:
         for i, joint in enumerate(self.model.joints[2:]):
             if joint.nq == 1:
                 limits[i] = self.model.lowerPositionLimit[joint.idx_q], self.model.upperPositionLimit[joint.idx_q]
-        return limits
+        return fixed_array(limits)
 
     def frame_id(self, name: str) -> int:
-        """Return the index of a link's frame, else of any other; a joint and a link may share a name."""
+        """Return the index of a link's frame, else of any other; a joint and a link may share a name.
+
+        Raises:
+            InputError: no such frame.
+        """
+        as_text("frame", name, f"it is the name of a frame of '{self.name}'")
         for kinds in (pin.FrameType.BODY, pin.FrameType.OP_FRAME, pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT):
             if self.model.existFrame(name, kinds):
                 return int(self.model.getFrameId(name, kinds))
@@ -256,6 +284,27 @@ class Robot:
                 f"robot '{self.name}': its links weigh {written:g} kg but Pinocchio reads {read:g} kg of them; an "
                 "<inertial> is malformed"
             )
+
+    def refuse_changed_model(self) -> None:
+        """Look whether `model` still is what the URDF says.
+
+        Raises:
+            ModelError: an inertia or a placement was changed after the robot was made; the joint is named.
+        """
+        for joint, (now, then) in enumerate(zip(_bodies_of(self.model), self._bodies, strict=True)):
+            if not np.array_equal(now, then):
+                raise ModelError(
+                    f"robot '{self.name}': the body or the placement of joint '{self.model.names[joint]}' in "
+                    "robot.model was changed after the robot was made, so that its URDF and its records would tell of "
+                    "another robot; change the URDF, or use with_payload(..), with_locked(..) or perturbed(..)"
+                )
+
+    def _warn_of_degrees(self, positions: Mapping[str, float]) -> None:
+        sizes = np.zeros(self.n_joints)
+        for name, position in positions.items():
+            if name in self.joint_names:
+                sizes[self.joint_index(name)] = abs(float(position))
+        warn_of_degrees(self, "joint positions", sizes, FARTHEST, "rad")
 
     def _refuse_singular_inertia(self) -> None:
         pin.computeCentroidalMap(self.model, self._data, self._neutral)
@@ -288,11 +337,14 @@ class Robot:
 
         Raises:
             InputError: wrong length, an unknown joint name, a value that is not finite, or no rigid pose.
+
+        Warns:
+            DecoupleWarning: a joint that turns is more than two turns from zero, which looks like degrees.
         """
         displacement = np.zeros(self.model.nv)
         if isinstance(joints, Mapping):
             for name, value in joints.items():
-                displacement[6 + self.joint_index(name)] = as_floats(f"joint position {name}", value)
+                displacement[6 + self.joint_index(name)] = as_number(f"joint position {name}", value)
         elif joints is not None:
             values = as_floats("joint positions", joints)
             if values.shape != (self.n_joints,):
@@ -304,6 +356,7 @@ class Robot:
         if not np.all(np.isfinite(displacement)):
             bad = [self.joint_names[i] for i in np.flatnonzero(~np.isfinite(displacement[6:]))]
             raise InputError(f"joint positions are not finite at {', '.join(bad)}")
+        warn_of_degrees(self, "joint positions", np.abs(displacement[6:]), FARTHEST, "rad")
         q: Floats = pin.integrate(self.model, self._neutral, displacement)
         if base_pose is not None:
             q[:7] = pin.SE3ToXYZQUAT(rigid_pose("base_pose", base_pose))
@@ -318,7 +371,9 @@ class Robot:
         try:
             return self.joint_names.index(name)
         except ValueError:
-            raise InputError(f"'{self.name}' has no joint '{name}'; it has {', '.join(self.joint_names)}") from None
+            raise InputError(
+                f"'{self.name}' has no joint {shown(name)}; it has {', '.join(self.joint_names)}"
+            ) from None
 
     def joint_positions(self, q: ArrayLike) -> Floats:
         """Return the joint positions (n,), rad or m, of a configuration; continuous joints within (-pi, pi]."""
@@ -341,10 +396,10 @@ class Robot:
                 f"configuration is not finite at q[{', '.join(map(str, np.flatnonzero(~np.isfinite(values))))}]"
             )
         length = float(np.linalg.norm(values[3:7]))
-        if abs(length - 1.0) > 1e-6:
+        if abs(length - 1.0) > UNIT:
             raise InputError(f"quaternion q[3:7] has length {length:.7g}, not 1; use pinocchio.normalize(model, q)")
         for joint in self.model.joints[2:]:
-            if joint.nq == 2 and abs(float(np.hypot(*values[joint.idx_q : joint.idx_q + 2])) - 1.0) > 1e-6:
+            if joint.nq == 2 and abs(float(np.hypot(*values[joint.idx_q : joint.idx_q + 2])) - 1.0) > UNIT:
                 raise InputError(
                     f"continuous joint '{self.model.names[joint.id]}' takes cosine and sine, q[{joint.idx_q}:"
                     f"{joint.idx_q + 2}] is {values[joint.idx_q : joint.idx_q + 2].tolist()}; build q with "
@@ -406,7 +461,7 @@ class Robot:
         Raises:
             InputError: q or v has the wrong length or is not finite.
         """
-        velocity = np.asarray(v, dtype=float)
+        velocity = as_floats("velocity", v)
         if velocity.shape != (self.model.nv,) or not np.all(np.isfinite(velocity)):
             raise InputError(
                 f"velocity needs {self.model.nv} finite numbers: base twist (6), joint rates ({self.n_joints})"
@@ -441,8 +496,50 @@ def rigid_pose(name: str, pose: pin.SE3 | ArrayLike) -> pin.SE3:
     return pin.SE3(rotation, matrix[:3, 3])
 
 
+def checked_robot(robot: Robot) -> Robot:
+    """Return a robot.
+
+    Raises:
+        InputError: it is none; the message says how one is loaded.
+    """
+    mend = f"load it with load_robot({shown(robot)})" if isinstance(robot, str) else "load one with load_robot(..)"
+    return as_kind("robot", robot, Robot, mend)
+
+
+def warn_of_degrees(robot: Robot, name: str, sizes: Floats, largest: float, unit: str) -> None:
+    """Warn where a joint that turns, other than a wheel, has a number above what radians would come to.
+
+    Args:
+        robot: The robot.
+        name: What the numbers are called.
+        sizes: (n,); infinite ones are no numbers.
+        largest: What is looked at as degrees above it.
+        unit: Of the numbers.
+
+    Warns:
+        DecoupleWarning: the message names the joint.
+    """
+    for joint in np.flatnonzero((sizes > largest) & np.isfinite(sizes)):
+        kind, called = robot.model.joints[int(joint) + 2].shortname(), robot.joint_names[joint]
+        if not kind.startswith("JointModelP") and called not in robot.wheel_names:
+            warnings.warn(
+                f"{name} of '{robot.name}': {sizes[joint]:g} {unit} at '{called}' looks like degrees; use "
+                f"numpy.deg2rad(..)",
+                DecoupleWarning,
+                stacklevel=4,
+            )
+            return
+
+
+def _bodies_of(model: pin.Model) -> Floats:
+    """Return what a model's bodies and joints are made of (joints, 22): inertias and placements."""
+    inertias = [inertia.toDynamicParameters() for inertia in model.inertias]
+    placements = [placement.homogeneous[:3].ravel() for placement in model.jointPlacements]
+    return np.hstack([inertias, placements])
+
+
 def per_joint(robot: Robot, name: str, given: ArrayLike, infinity: str = "infinity for no limit") -> Floats:
-    """Return numbers above zero (n,), from one for all joints or one for each.
+    """Return numbers above zero (n,), read-only, from one for all joints or one for each.
 
     Raises:
         InputError: they do not fit; the message calls them `name`. `infinity` says what infinity means, "finite" that
@@ -452,5 +549,5 @@ def per_joint(robot: Robot, name: str, given: ArrayLike, infinity: str = "infini
     if values.shape not in ((), (robot.n_joints,)):
         raise InputError(f"{name} has shape {values.shape}; give one number or one for each of {robot.n_joints} joints")
     if not np.all(values > 0) or (infinity == "finite" and not np.all(np.isfinite(values))):
-        raise InputError(f"{name} is {given!r}; every joint's must be above zero ({infinity})")
-    return np.broadcast_to(values, (robot.n_joints,)).copy()
+        raise InputError(f"{name} is {shown(given)}; every joint's must be above zero ({infinity})")
+    return fixed_array(np.broadcast_to(values, (robot.n_joints,)))

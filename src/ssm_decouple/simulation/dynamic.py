@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import pinocchio as pin
 import xarray as xr
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.control.schedule import ScheduledLaw
-from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_positive, as_seed
+from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_positive, as_seed, as_switch, shown
 from ssm_decouple.model.massless import refuse_singular_mass_matrix
 from ssm_decouple.model.plant import Plant
 from ssm_decouple.model.robot import UNLIMITED, Robot
@@ -50,6 +50,10 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
 }
 
 
+class DivergedError(FloatingPointError):
+    """The equations of motion have run away; the message says when, s."""
+
+
 @dataclass(frozen=True)
 class Servo:
     """The joint drives: computed torque, by the model that the law has, with a loop on position and rate.
@@ -71,14 +75,21 @@ class Servo:
     frequency: float = 2.0
     damping_ratio: float = 1.0
     period: float | None = None
-    torque_limits: Floats | float | None = None
+    torque_limits: ArrayLike | None = None
     protects: bool = False
 
     def __post_init__(self) -> None:
-        as_positive("servo frequency", self.frequency)
-        as_positive("servo damping_ratio", self.damping_ratio)
-        if self.period is not None:
-            as_positive("servo period", self.period)
+        for name in ("frequency", "damping_ratio", "period"):
+            if name != "period" or self.period is not None:
+                object.__setattr__(self, name, as_positive(f"servo {name}", getattr(self, name)))
+        object.__setattr__(self, "protects", as_switch("servo protects", self.protects))
+        if self.torque_limits is not None:
+            limits = as_floats("torque_limits", self.torque_limits)
+            if limits.ndim > 1 or not np.all(limits > 0):
+                raise InputError(
+                    f"torque_limits is {shown(self.torque_limits)}; give one positive number, N m, or one a joint"
+                )
+            object.__setattr__(self, "torque_limits", tuple(limits.tolist()) if limits.ndim else float(limits))
 
 
 @dataclass(frozen=True)
@@ -99,8 +110,8 @@ class Sensors:
 
     def __post_init__(self) -> None:
         for name in ("encoder_noise", "encoder_resolution", "gyro_noise"):
-            as_not_negative(name, getattr(self, name))
-        as_seed("seed of the sensors", self.seed)
+            object.__setattr__(self, name, as_not_negative(name, getattr(self, name)))
+        object.__setattr__(self, "seed", as_seed("seed of the sensors", self.seed))
 
 
 @dataclass(frozen=True)
@@ -122,10 +133,12 @@ class Load:
     def __post_init__(self) -> None:
         wrench = as_floats("load force", self.force), as_floats("load torque", self.torque)
         if any(part.shape != (3,) or not np.all(np.isfinite(part)) for part in wrench):
-            raise InputError(f"load is {self}; force and torque need 3 finite numbers each")
-        as_not_negative("start of the load", self.start)
-        if not float(as_floats("duration of the load", self.duration)) > 0:
-            raise InputError(f"duration of the load is {self.duration}; it must be above zero, s, or infinite")
+            raise InputError(f"load is {shown(self)}; force and torque need 3 finite numbers each")
+        object.__setattr__(self, "start", as_not_negative("start of the load", self.start))
+        duration = as_floats("duration of the load", self.duration)
+        if duration.shape != () or not duration > 0:
+            raise InputError(f"duration of the load is {shown(self.duration)}; it must be above zero, s, or infinite")
+        object.__setattr__(self, "duration", float(duration))
         for name, part in zip(("force", "torque"), wrench, strict=True):
             object.__setattr__(self, name, tuple(part.tolist()))
 
@@ -154,13 +167,13 @@ class Dynamic:
     feedback_gain: float = 0.0
 
     def __post_init__(self) -> None:
-        as_positive("physics step", self.step)
-        as_not_negative("feedback_gain", self.feedback_gain)
+        object.__setattr__(self, "step", as_positive("physics step", self.step))
+        object.__setattr__(self, "feedback_gain", as_not_negative("feedback_gain", self.feedback_gain))
         kinds = {"servo": Servo, "plant": Robot, "sensors": Sensors, "load": Load}
         for name, kind in kinds.items():
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
-                raise InputError(f"{name} is {value!r}; give a {kind.__name__}, or None")
+                raise InputError(f"{name} is {shown(value)}; give a {kind.__name__}, or None")
         if self.servo is not None and self.servo.protects and self.feedback_gain:
             raise InputError(
                 "feedback_gain and a servo that protects would both hold the protected directions; use one"
@@ -299,7 +312,7 @@ class DynamicMotion:
             and in those of the law's directions.
 
         Raises:
-            FloatingPointError: the motion has diverged; the message says when.
+            DivergedError: the motion has run away; the message says when.
         """
         held, before = _holding(self.settings, t, t_next), self.totals[:6].copy()
         start, first = self._law_configuration(self.q[self.driven]), self._law_velocity()
@@ -317,7 +330,7 @@ class DynamicMotion:
             self.totals,
         )
         if bad != physics.OK:
-            raise FloatingPointError(f"{t + bad * held[physics.STEP]:.6g}")
+            raise DivergedError(f"{t + bad * held[physics.STEP]:.6g}")
         twist = self.totals[:6] - before
         self._measure(twist, t_next - t)
         end, dt = self._law_configuration(self.q[self.driven]), t_next - t
@@ -452,7 +465,7 @@ def _torque_limits(robot: Robot, servo: Servo | None) -> Floats:
         return np.where((efforts > 0) & (efforts < UNLIMITED), efforts, np.inf)
     limits = as_floats("torque_limits", servo.torque_limits)
     if limits.shape not in ((), (robot.n_joints,)) or not np.all(limits > 0):
-        raise InputError(f"torque_limits is {limits.tolist()}; give one positive number or {robot.n_joints}")
+        raise InputError(f"torque_limits is {shown(limits.tolist())}; give one positive number or {robot.n_joints}")
     return np.broadcast_to(limits, (robot.n_joints,)).copy()
 
 

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import FileError
-from ssm_decouple.files import written_whole
+from ssm_decouple.errors import FileError, as_kind, as_path
+from ssm_decouple.files import is_file, written_whole
 from ssm_decouple.model.robot import Robot
 
 Floats = NDArray[np.float64]
@@ -409,8 +409,10 @@ def save_motion(motion: xr.Dataset, path: str | Path) -> Path:
 
     Raises:
         FileError: the place cannot be written.
+        InputError: it is no motion, or no path.
     """
-    final = Path(path)
+    as_kind("motion", motion, xr.Dataset, "give what simulate(..) or load_motion(..) returns")
+    final = as_path("path", path)
     with written_whole(final) as temporary:
         motion.to_netcdf(temporary, engine="h5netcdf")
     return final
@@ -422,7 +424,8 @@ def load_motion(path: str | Path) -> xr.Dataset:
     Raises:
         FileError: no such file, not netCDF, or not a motion of this package; what is missing is named.
     """
-    if not Path(path).is_file():
+    path = as_path("path", path)
+    if not is_file(path):
         raise FileError(f"no motion at '{path}': not a file")
     try:
         with xr.open_dataset(path, engine="h5netcdf") as opened:

@@ -20,11 +20,15 @@ from ssm_decouple.errors import (
     DecoupleWarning,
     InputError,
     as_floats,
+    as_function,
+    as_kind,
     as_not_negative,
     as_positive,
+    as_switch,
     as_triple,
+    shown,
 )
-from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
+from ssm_decouple.simulation.dynamic import DivergedError, Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import Outcome, build_motion, error_of, judge
 from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted, sample_times
 
@@ -110,10 +114,18 @@ def simulate(
         InputError: an argument makes no sense; the message names it.
         DivergenceError: the numbers of a dynamic simulation run away; it carries the motion until then.
         SimulationInterrupted: Ctrl-C; it is a KeyboardInterrupt and carries the motion so far.
+        Exception: whatever a function of yours raises (target, protected_rate, progress, that of a schedule) comes
+            through as it is. An error in the middle of the motion carries the motion so far as its attribute `motion`.
     """
+    as_kind("law", law, SelectiveLaw, "give a law, such as SelectiveLaw(robot, Protection('yaw'))")
     time = sample_times(duration, dt)
-    if not isinstance(method, Dynamic) and method not in STEPS:
-        raise InputError(f"method '{method}' is unknown: use {', '.join(STEPS)} or a Dynamic")
+    duration, dt = float(time[-1]), as_positive("dt", dt)
+    if not (isinstance(method, Dynamic) or (isinstance(method, str) and method in STEPS)):
+        raise InputError(f"method {shown(method)} is unknown: use {', '.join(STEPS)} or a Dynamic")
+    law.robot.refuse_changed_model()
+    as_function("progress", progress)
+    stop_early = as_switch("stop_early", stop_early)
+    smooth_start = as_not_negative("smooth_start", smooth_start)
     _refuse_unfit_method(law, method, duration, dt)
     tolerance = as_positive("arrival_tolerance", arrival_tolerance, "it must be a positive distance, m")
     reference = _reference(law, target)
@@ -122,7 +134,7 @@ def simulate(
     if law.layout.tool_target is not None:
         _warn_out_of_reach(law, run.configurations[0], reference(0.0)[0][law.layout.tool_target])
     law.check_start(run.configurations[0])
-    run.settings = {"arrival_tolerance": tolerance, "smooth_start": float(smooth_start)}
+    run.settings = {"arrival_tolerance": tolerance, "smooth_start": smooth_start}
     tick = max(1, time.size // 100)
     try:
         for i in range(time.size):
@@ -133,18 +145,22 @@ def simulate(
                 # Slow on purpose is not stalled.
                 if stop_early and time[i] >= smooth_start and run.ended(tolerance):
                     break
+        if progress is not None:
+            progress(1.0)
     except KeyboardInterrupt:
         if run.done == 0:
             raise
         raise SimulationInterrupted(run.record()) from None
-    except FloatingPointError as when:
+    except DivergedError as when:
         raise DivergenceError(
             f"the simulation has diverged at {when} s: the equations of motion run away or have no solution there; try "
             "a shorter physics step or a softer servo",
             run.record(),
         ) from None
-    if progress is not None:
-        progress(1.0)
+    except Exception as error:
+        if run.done:
+            _give_motion(error, run)
+        raise
     return run.record()
 
 
@@ -225,6 +241,15 @@ class _Run:
         return motion
 
 
+def _give_motion(error: Exception, run: _Run) -> None:
+    """Attach the motion so far to an error, the user's or ours, that ends it."""
+    try:
+        error.motion = run.record()  # type: ignore[attr-defined]
+    except Exception:  # it takes no attribute, or a function of the user's fails once more: the first error counts
+        return
+    error.add_note(f"the motion until {run.time[run.done - 1]:g} s is this error's attribute 'motion'")
+
+
 def _refuse_unfit_method(law: SelectiveLaw, method: Method | Dynamic, duration: float, dt: float) -> None:
     if law.sample_time is not None and abs(law.sample_time - dt) > 1e-9 * dt:
         raise InputError(f"the law's sample_time is {law.sample_time:g} s, dt is {dt:g} s; they must be the same")
@@ -241,8 +266,6 @@ def _refuse_unfit_method(law: SelectiveLaw, method: Method | Dynamic, duration: 
 
 
 def _smooth_pace(duration: float) -> Pace:
-    duration = as_not_negative("smooth_start", duration)
-
     def pace(time: float) -> float:
         if time >= duration:
             return 1.0
@@ -258,13 +281,13 @@ def _reference(law: SelectiveLaw, target: Any | Target) -> Reference:
     if callable(target):
 
         def moving(time: float) -> tuple[Floats, Floats]:
-            try:
-                position, velocity = target(time)
-            except (TypeError, ValueError):
+            told = target(time)
+            if not isinstance(told, tuple | list | np.ndarray) or len(told) != 2:
                 raise InputError(
                     "a target function returns two things: position (3,) and velocity (3,), or what the tasks take and "
-                    "its velocity"
-                ) from None
+                    f"its velocity; at {time:g} s it has returned {shown(told)}"
+                )
+            position, velocity = told
             if law.layout.plain:
                 return (
                     as_triple("target position", position, "inertial axes"),
@@ -306,7 +329,7 @@ def _wanted(
 
 def _finite(values: Floats, name: str) -> Floats:
     if not np.all(np.isfinite(values)):
-        raise InputError(f"{name} is not finite: {values.tolist()}")
+        raise InputError(f"{name} is not finite: {shown(values.tolist())}")
     return values
 
 

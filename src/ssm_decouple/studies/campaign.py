@@ -20,11 +20,23 @@ from numpy.typing import NDArray
 from ssm_decouple.batch import Batch
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.control.schedule import Schedule
-from ssm_decouple.errors import DecoupleError, DecoupleWarning, FileError, InputError, as_seed, unknown
+from ssm_decouple.errors import (
+    DecoupleError,
+    DecoupleWarning,
+    FileError,
+    InputError,
+    as_function,
+    as_kind,
+    as_path,
+    as_seed,
+    as_whole,
+    unknown,
+)
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.perturb import Tolerances, perturbed
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.settled import Settled, fixed
 from ssm_decouple.simulation.dynamic import Dynamic
 from ssm_decouple.studies.case import Case, case_of, cases, load_case
 from ssm_decouple.studies.schema import LIST, NUMBER, TEXT, check_keys
@@ -116,7 +128,7 @@ class Drawn:
 
 
 @dataclass
-class Campaign:
+class Campaign(Settled):
     """Cases crossed with protections, each combination sampled many times.
 
     Rows are numbered case by case, protection by protection, sample by sample. All that a row rests on is the record:
@@ -137,6 +149,7 @@ class Campaign:
     cases: tuple[Case, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        self.record = fixed(as_kind("record", self.record, Mapping, "read a campaign with Campaign.load(..)"))  # type: ignore[type-abstract]
         self.cases = tuple(_rebuilt(told) for told in self.record["cases"])
         for case in self.cases:
             self._refuse_unfit(case)
@@ -154,7 +167,7 @@ class Campaign:
             InputError: no such file, not TOML, an unknown key (the nearest known one is named), a missing key, a value
                 that makes no sense, or a case that cannot be run.
         """
-        source = Path(path).expanduser()
+        source = as_path("campaign", path)
         try:
             text = source.read_text(encoding="utf-8")
             spec = tomllib.loads(text)
@@ -227,7 +240,7 @@ class Campaign:
         Raises:
             InputError: no such row.
         """
-        if not 0 <= row < self.size:
+        if as_whole("sample", row, -1) not in range(self.size):
             raise InputError(f"there is no sample {row}: they are numbered from 0 to {self.size - 1}")
         combination, draw = divmod(row, self.samples)
         case, protection = divmod(combination, len(self.protections))
@@ -348,6 +361,8 @@ class Campaign:
         from ssm_decouple.studies.store import Store
         from ssm_decouple.studies.workers import Interrupts, pool_of
 
+        as_function("progress", progress)
+        as_function("note", note)
         with ExitStack() as open_things:
             interrupts = open_things.enter_context(Interrupts())
             with interrupts.held():

@@ -28,10 +28,23 @@ from ssm_decouple.control.task import (
     RelativePoseTask,
     Task,
 )
-from ssm_decouple.errors import DecoupleError, InputError, as_floats, unknown
+from ssm_decouple.errors import (
+    DecoupleError,
+    InputError,
+    as_floats,
+    as_kind,
+    as_path,
+    as_positive,
+    as_text,
+    as_triple,
+    shown,
+    unknown,
+)
+from ssm_decouple.files import is_file
 from ssm_decouple.model.catalogue import load_robot, models
 from ssm_decouple.model.robot import Robot
-from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.momentum.protection import Protection, checked_protection
+from ssm_decouple.settled import fixed, fixed_array
 from ssm_decouple.simulation.dynamic import Dynamic, Servo
 from ssm_decouple.simulation.simulate import Progress, simulate
 from ssm_decouple.simulation.steps import STEPS
@@ -123,7 +136,7 @@ _ANY_TASK = {"kind": (TEXT, True), "gain": (NUMBER, False), "weight": (NUMBER, F
 
 @dataclass(frozen=True)
 class Case:
-    """One motion to simulate. Units are SI and radians.
+    """One motion to simulate. Units are SI and radians. What it holds is read-only: `dataclasses.replace` changes it.
 
     Attributes:
         name: Short name, used for file names.
@@ -158,6 +171,30 @@ class Case:
     dt: float = 0.1
     simulation: Mapping[str, Any] = field(default_factory=dict)
     turned: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        """Refuse what is no case, and keep copies that stay as they are.
+
+        Raises:
+            InputError: a setting of another kind; the message names it.
+        """
+        as_text("name of a case", self.name)
+        as_path("robot of a case", self.robot_source)
+        if not isinstance(self.protection, Schedule):
+            checked_protection(self.protection)
+        joints = self.joints
+        if joints is not None:
+            joints = fixed(joints) if isinstance(joints, Mapping) else fixed_array(as_floats("joints", joints))
+        kept: dict[str, Any] = {"joints": joints, "target": fixed(self.target)}
+        for name in ("base_position", "base_rpy"):
+            kept[name] = tuple(as_triple(name, getattr(self, name)).tolist())
+        for name in ("duration", "dt"):
+            kept[name] = as_positive(name, getattr(self, name), "it must be a positive time, s")
+        for name in ("law", "simulation", "turned"):
+            mend = "give a table of settings by name"
+            kept[name] = fixed(as_kind(name, getattr(self, name), Mapping, mend))  # type: ignore[type-abstract]
+        for name, value in kept.items():
+            object.__setattr__(self, name, value)
 
     @cached_property
     def robot(self) -> Robot:
@@ -215,7 +252,10 @@ class Case:
             law, start = self.make_law(protection, dt), self.start()
             motion = simulate(law, start, self.target, self.duration, step, progress=progress, **self.simulation)
         except InputError as error:
-            raise InputError(f"case '{self.name}': {error}") from error
+            told = InputError(f"case '{self.name}': {error}")
+            if hasattr(error, "motion"):
+                told.motion = error.motion  # type: ignore[attr-defined]
+            raise told from error
         motion.attrs |= {
             "case": self.name,
             "title": self.title,
@@ -225,6 +265,16 @@ class Case:
             "turned": json.dumps(dict(self.turned)),
         }
         return motion
+
+
+def checked_case(case: Case) -> Case:
+    """Return a case.
+
+    Raises:
+        InputError: it is none; the message says how one is loaded.
+    """
+    mend = f"load it with load_case({shown(case)})" if isinstance(case, str) else "load one with load_case(..)"
+    return as_kind("case", case, Case, mend)
 
 
 def cases() -> dict[str, Path]:
@@ -246,12 +296,9 @@ def load_case(source: str | Path) -> Case:
             of the wrong kind.
     """
     catalogue = cases()
-    path = catalogue.get(str(source), Path(source).expanduser())
-    try:
-        found = path.is_file()
-    except OSError:  # a name too long to be one
-        found = False
-    if not found:
+    path = as_path("case", source, f"give a path, or one of the cases {', '.join(catalogue)}")
+    path = catalogue.get(str(source), path)
+    if not is_file(path):
         raise InputError(f"'{source}' is neither a file nor one of the cases {', '.join(catalogue)}")
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))

@@ -13,11 +13,12 @@ import numpy as np
 import xarray as xr
 
 from ssm_decouple.control.schedule import Schedule
+from ssm_decouple.errors import InputError, as_kind
 from ssm_decouple.files import written_whole
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.motion import error_of, robot_of
 from ssm_decouple.simulation.replay import integral_along, rates_along
-from ssm_decouple.studies.case import Case
+from ssm_decouple.studies.case import Case, checked_case
 
 LAWS = ("none", "selective", "reactionless")
 UNDAMPED = ", undamped"  # behind a law's name: the same with rho = 0
@@ -91,6 +92,9 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         motion: A motion of a case, from `Case.run`.
         law: What the row is called.
     """
+    as_kind("motion", motion, xr.Dataset, "give a motion of a case, as Case.run(..) returns it")
+    if "case_U_c" not in motion.attrs:
+        raise InputError("the motion is of no case; give one that Case.run(..) returns")
     time, error = motion.time.values, error_of(motion)
     rate, angle = disturbance(motion)
     swing = np.rad2deg(np.ptp(motion.base_rpy.values, axis=0))
@@ -233,6 +237,15 @@ class Comparison:
     case: Case
     motions: Mapping[str, xr.Dataset]
 
+    def __post_init__(self) -> None:
+        """Refuse what is no case, or no table of motions.
+
+        Raises:
+            InputError: the message names it.
+        """
+        checked_case(self.case)
+        as_kind("motions", self.motions, Mapping, "give motions by the name of their law")  # type: ignore[type-abstract]
+
     def summaries(self) -> list[Summary]:
         """Return one row of figures a law."""
         return [summarise(motion, law) for law, motion in self.motions.items()]
@@ -266,7 +279,7 @@ def compare_step_by_step(
         The law's name and the motion. Where the damping acted, the same law undamped follows: how a singular system is
         regularised decides where the arm ends, so both are shown.
     """
-    undamped = replace(case, law={**case.law, "damping": 0.0})
+    undamped = replace(checked_case(case), law={**case.law, "damping": 0.0})
 
     def run(law: str, variant: Case, protection: Protection | Schedule) -> xr.Dataset:
         return variant.run(protection, dt, None if progress is None else lambda share: progress(law, share))
@@ -291,7 +304,7 @@ def compare(case: Case, dt: float | None = None) -> Comparison:
     Raises:
         DecoupleError: the case cannot be run; the message says why.
     """
-    return Comparison(case, dict(compare_step_by_step(case, dt)))
+    return Comparison(checked_case(case), dict(compare_step_by_step(case, dt)))
 
 
 def write_csv(rows: Sequence[Any], path: str | Path) -> Path:

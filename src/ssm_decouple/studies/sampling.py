@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ssm_decouple.studies.case import Case
+from ssm_decouple.errors import as_items
+from ssm_decouple.studies.case import Case, checked_case
 from ssm_decouple.studies.comparison import disturbance
 
 SAMPLE_TIMES = (0.02, 0.05, 0.1, 0.2, 0.5)
@@ -55,6 +56,8 @@ def sampling(
     Yields:
         One result for each way and time, from the longest time to the shortest.
     """
+    checked_case(case)
+    sample_times = as_items("sample_times", sample_times, "give a list of times, s")
     for nodes in PLANS:
         before: Drift | None = None
         for dt in sorted(sample_times, reverse=True):

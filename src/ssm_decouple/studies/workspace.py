@@ -17,15 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc, t
 
 from ssm_decouple.batch.engine import Batch
-from ssm_decouple.errors import InputError, as_positive, as_seed
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.errors import InputError, as_floats, as_items, as_positive, as_seed, as_whole
+from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.settled import Settled
 from ssm_decouple.studies.postures import MARGIN, PROTECTIONS, joint_ranges
 from ssm_decouple.studies.shares import CONFIDENCE, wilson
 
@@ -108,7 +110,7 @@ class Grid:
         Raises:
             InputError: the size is not positive, or so small that there are more than `VOXELS` cubes.
         """
-        size = as_positive("voxel", robot.reach / PER_REACH if edge is None else edge)
+        size = as_positive("voxel", checked_robot(robot).reach / PER_REACH if edge is None else edge)
         half = int(np.ceil(robot.reach / size))
         count = 2 * half + 1
         if count**3 > VOXELS:
@@ -194,7 +196,7 @@ class Elites:
 
 
 @dataclass
-class Workspace:
+class Workspace(Settled):
     """Which postures and places of one robot protections leave fit for work; what is done stays when interrupted.
 
     Postures are drawn uniformly within `joint_ranges`, by `BLOCKS` independently scrambled Sobol sequences; after each
@@ -219,6 +221,8 @@ class Workspace:
         elites: The best postures so far.
     """
 
+    _assignable: ClassVar[tuple[str, ...]] = ("drawn", "elites")
+
     robot: Robot
     margin: float = MARGIN
     samples: int = SAMPLES
@@ -241,15 +245,15 @@ class Workspace:
             InputError: fewer than three joints, a joint without a range, a margin that is not positive, no samples, a
                 seed that is none, or a voxel size that makes no sense.
         """
-        if self.robot.n_joints < 3:
+        if checked_robot(self.robot).n_joints < 3:
             raise InputError(
                 f"'{self.robot.name}' has {self.robot.n_joints} joints, but a position takes three freedoms; give a "
                 "robot with three joints or more"
             )
         self.margin = as_positive("margin", self.margin)
-        as_seed("seed", self.seed)
-        if not isinstance(self.samples, int) or isinstance(self.samples, bool) or self.samples < 1:
-            raise InputError(f"samples is {self.samples!r}; give a positive whole number, such as {SAMPLES}")
+        self.seed = as_seed("seed", self.seed)
+        self.samples = as_whole("samples", self.samples, 1, f"give a positive whole number, such as {SAMPLES}")
+        self.protections = tuple(as_items("protections", self.protections, "give a list, such as ['none', 'yaw']"))
         self._ranges = joint_ranges(self.robot)
         self.grid = Grid.about(self.robot, self.voxel)
         self.margins = tuple(sorted({*MARGINS, self.margin}))
@@ -432,14 +436,18 @@ def joint_slice(
     Raises:
         InputError: no such joint, or one without a range.
     """
-    i, j = (robot.joint_index(name) for name in joints)
+    i, j = (checked_robot(robot).joint_index(name) for name in as_items("joints", joints, "give the names of two"))
+    points = as_whole("points", points, 2)
+    posture = as_floats("posture", posture)
+    if posture.shape != (robot.n_joints,):
+        raise InputError(f"posture has shape {posture.shape}; it needs ({robot.n_joints},), a position a joint")
     ranges = joint_ranges(robot)
     first, second = (np.linspace(low, high, points) for low, high in ranges[[i, j]])
-    rows = np.tile(np.asarray(posture, dtype=float), (points * points, 1))
+    rows = np.tile(posture, (points * points, 1))
     rows[:, i], rows[:, j] = np.repeat(first, points), np.tile(second, points)
     sigma = Batch(robot).singular_values(rows, [Protection.parse(text) for text in protections])
     shaped = sigma.T.reshape(len(protections), points, points)
-    return JointSlice(joints, np.array(posture, dtype=float), (first, second), tuple(protections), shaped)
+    return JointSlice(joints, posture, (first, second), tuple(protections), shaped)
 
 
 def arm_joints(robot: Robot) -> list[str]:
