@@ -259,6 +259,7 @@ class LimitedStep:
         self._parameters: Floats = np.array([self.sample_time, limits.braking, distance, 0.0])
         self._steps: Floats = columns[kernel.ACCELERATION] * self.sample_time
         self._buffers: dict[tuple[Any, ...], _Buffers] = {}
+        self._last: _Buffers | None = None
         self._no_rows: tuple[Floats, Floats] = np.empty((0, n)), np.empty(0)
 
     def __call__(
@@ -307,7 +308,7 @@ class LimitedStep:
         buffers = self._buffers.get(key)
         if buffers is None:
             buffers = self._buffers[key] = self._fitting(key)
-        table, told = buffers.table, buffers.told
+        table, told, self._last = buffers.table, buffers.told, buffers
         self._parameters[kernel.NOISE] = noise
         status = kernel.prepare(
             self._columns,
@@ -341,6 +342,16 @@ class LimitedStep:
         bounds = table[: kernel.RETURN + 1].copy()
         near = buffers.sides[kernel.APART].copy() if len(distances) else None
         return LimitedRates(rates, self.robot.joint_names, bounds, near, share, excess, bool(told[kernel.STOPPABLE]))
+
+    def take_out_rounding(self, J_sub: Floats, scale: Floats, found: LimitedRates) -> None:
+        """Bring scale times the rates of the last step into null(J_sub / scale), or to what is wanted of it, in place.
+
+        J_sub (k, n) and its rank are those of the step: its rates, times `scale` (n,), have rounded once more.
+        """
+        assert self._last is not None
+        table, factors, told = self._last.table, self._last.factors, self._last.told
+        residual = (J_sub / scale) @ (scale * found.joint_rates) - found.share * factors[kernel.ATTAINED, : len(J_sub)]
+        kernel.take_out(residual, table, factors, int(told[kernel.RANK]), found.joint_rates)
 
     def _fitting(self, key: tuple[Any, ...]) -> _Buffers:
         """Return buffers for arguments of these shapes, which are checked once."""

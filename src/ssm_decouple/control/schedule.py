@@ -26,6 +26,8 @@ _OF_THE_BRIDGE: tuple[int | slice, ...] = (  # what a hand-over's results are, o
     kernel.PLAN_CHANGE,
     kernel.EXCESS,
     kernel.LIMITED,
+    kernel.LOST,
+    kernel.LOST_TO,
 )
 SHARED = 1e-12  # how far from 1 the cosine between two subspaces may be for a direction to count as in both
 
