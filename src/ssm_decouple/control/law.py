@@ -392,6 +392,13 @@ class SelectiveLaw:
     def momentum(self, momentum: ArrayLike | None) -> None:
         self._set_momentum(momentum)
 
+    def seen_from(self, origin: Floats) -> SelectiveLaw:
+        """Return the law for configurations whose base position is counted from another origin (3,), m.
+
+        It is this one: nothing in it depends on where the base is.
+        """
+        return self
+
     def _set_momentum(self, momentum: ArrayLike | None) -> None:
         values = np.zeros(6) if momentum is None else as_floats("momentum", momentum)
         if values.shape != (6,) or not np.all(np.isfinite(values)):

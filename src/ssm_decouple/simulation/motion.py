@@ -17,6 +17,7 @@ from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.errors import FileError
 from ssm_decouple.files import written_whole
+from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.robot import Robot
 
 Floats = NDArray[np.float64]
@@ -309,9 +310,8 @@ def _wheels(law: SelectiveLaw, time: Floats, values: Floats) -> tuple[Floats, di
     for i, name in enumerate(robot.wheel_names):
         joint = robot.model.joints[robot.model.getJointId(name)]
         axis, at = np.ravel(joint.createData().S)[3:], robot.joint_index(name)
-        spin_inertia = axis @ robot.model.inertias[joint.id].inertia @ axis
         speed = values[:, 6 + at]
-        stored[:, i] = spin_inertia * (speed + values[:, 3:6] @ axis)
+        stored[:, i] = robot.wheel_inertias[i] * (speed + values[:, 3:6] @ axis)
         full = np.abs(speed) >= (1.0 - 1e-9) * law.rate_limits[at]
         if full.any():
             spans[name] = flagged_spans(time, full[:-1] if len(time) > 1 else full)
@@ -342,8 +342,11 @@ def _audit(model: pin.Model, configurations: Floats, velocities: Floats) -> tupl
     data = model.createData()
     total, centre = data.hg, data.com[0]
     for i, (q, v) in enumerate(zip(configurations, velocities, strict=True)):
-        pin.computeCentroidalMomentum(model, data, q, v)
+        near = from_base(q)
+        pin.computeCentroidalMomentum(model, data, near, v)
         momenta[i], centres[i] = total.vector, centre
+        if near is not q:
+            centres[i] += q[:3]
     return momenta, centres
 
 
