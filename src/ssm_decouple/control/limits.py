@@ -28,6 +28,9 @@ KINDS = {
 TOLERANCES = {"primal_tol": 1e-12, "dual_tol": 1e-12, "iter_limit": 500}
 LEAST = 1e-11  # weight of the rates beside that of what exceeds the acceleration limits
 KEPT = 1e-7  # share of the acceleration limits that is left for rounding there
+# Weight of the change of the rates, as kernel.STEADY, while joints or pairs of bodies are brought back inside their
+# limits: beside bounds that leave them hardly any way, the others would be thrown from limit to limit.
+RETURN_STEADY = 0.5
 
 
 @dataclass(frozen=True)
@@ -381,18 +384,19 @@ class LimitedStep:
             joints, pairs = np.flatnonzero(table[kernel.RETURN]), np.flatnonzero(buffers.sides[kernel.APART])
             J = np.vstack([np.eye(n)[joints], G[pairs]])
             v = np.r_[table[kernel.RETURN, joints], buffers.sides[kernel.APART, pairs]]
-            self._step(buffers, J, v, 0.0, 0.0, first - asked, n - first + asked, asked, rates)
+            self._step(buffers, J, v, 0.0, RETURN_STEADY, first - asked, n - first + asked, asked, rates)
             kernel.hold_return(table, buffers.sides, G, rates)
         if asked:
             length = told[kernel.LENGTH]
             direction = table[kernel.FIXED : kernel.FIXED + 1] / length
             # More than is wanted is asked for, and a bound keeps it to that: so no regularisation takes from it.
             self._step(buffers, direction, np.array([1.01 * length]), 0.0, 0.0, first - 1, 1, asked, rates)
+        steady = RETURN_STEADY if told[kernel.RETURNING] else kernel.STEADY
         for number, (J, v, rho) in enumerate(levels):
             if first == n:
                 break
             decided = int(told[kernel.COUNTS + number])
-            self._step(buffers, J, v, rho, kernel.STEADY, first, decided, 0, rates)
+            self._step(buffers, J, v, rho, steady, first, decided, 0, rates)
             first += decided
 
     def _step(
