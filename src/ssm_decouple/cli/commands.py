@@ -314,14 +314,14 @@ class _Work(Products):
 
     def report(self) -> None:
         """Print the rows, the reasons and where the files are; leave with the interrupted status if it was."""
-        from ssm_decouple.viewing.table import explain, saturation, terminal_table
+        from ssm_decouple.viewing.table import explain, not_kept, saturation, terminal_table
 
         if self.as_json:
             self.print_json()
         elif self.rows:
             print_table(terminal_table(self.rows))
             for row in self.rows:
-                for remark in filter(None, (explain(row), saturation(row))):
+                for remark in filter(None, (explain(row), saturation(row), not_kept(row))):
                     typer.echo(remark)
             typer.echo(f"\n{len(self.files)} files in {self.folder}")
         if self.interrupted:

@@ -13,6 +13,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError, ModelError, as_items, as_not_negative, as_positive, shown
+from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.robot import Robot
 
 Floats = NDArray[np.float64]
@@ -145,7 +146,7 @@ class Distances:
         Args:
             q: Configuration (nq,).
         """
-        model, geometry, results = self.robot.model, self._geometry, self._results
+        model, geometry, results, q = self.robot.model, self._geometry, self._results, from_base(q)
         J = pin.computeJointJacobians(model, self._data, q)[:, 6:]
         pin.updateGeometryPlacements(model, self._data, geometry, results)
         pin.computeDistances(geometry, results)
@@ -201,7 +202,8 @@ class Distances:
         Raises:
             InputError: the message names them and says how deep.
         """
-        pin.updateGeometryPlacements(self.robot.model, self._data, self._geometry, self._results, self.robot.checked(q))
+        near = from_base(self.robot.checked(q))
+        pin.updateGeometryPlacements(self.robot.model, self._data, self._geometry, self._results, near)
         pin.computeDistances(self._geometry, self._results)
         for pair, result in zip(self.names, self._results.distanceResults, strict=True):
             if result.min_distance < 0.0:

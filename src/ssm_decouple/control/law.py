@@ -24,6 +24,7 @@ from ssm_decouple.errors import (
     as_whole,
     shown,
 )
+from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.robot import Robot, checked_robot, per_joint, warn_of_degrees
 from ssm_decouple.momentum.flow import munthe_kaas, places_on_hold, quadrature_along, ways_to_nodes
 from ssm_decouple.momentum.protection import Protection, checked_protection
@@ -51,6 +52,18 @@ CLIMB_SHARE = 0.25  # of the rate limits
 
 PASSES = 12  # at most; away from singularities each gains a factor of about sample time x joint rate
 CONVERGED = 1e-13  # relative change of the rates from pass to pass
+
+# What a protected rate is lost to, in words.
+LOST_TO = {
+    kernel.TO_RANK: "no joint rates give it: J_sub has lost rank",
+    kernel.TO_RATES: "the joint rates that it takes exceed the rate limits",
+    kernel.TO_LIMITS: "the joint rates that it takes exceed position, rate or acceleration limits",
+}
+
+
+def lost_to(code: float) -> tuple[str, ...]:
+    """Return in words what a protected rate was lost to, by the kernel's number."""
+    return tuple(words for bit, words in LOST_TO.items() if int(code) & bit)
 
 
 class CommandedMotion:
@@ -86,7 +99,7 @@ class CommandedMotion:
         """Constrained disturbance angular velocity w_sub = J_sub q_dot (.., k), rad/s (paper, eq. 6): rounding.
 
         Of a law with hold nodes, its mean over the hold. Where a rate was asked for it is that rate, or what of it the
-        arm and its rate limits can give. With directions of the whole twist it mixes m/s and rad/s.
+        arm and its rate limits can give; so it is with zero where there is momentum on board. With directions of the whole twist it mixes m/s and rad/s.
         """
         return self._results(kernel.PROTECTED_RATE, self.k)
 
@@ -178,6 +191,19 @@ class Command(CommandedMotion):
     def active_limits(self) -> int:
         """Of a law with `limits`: how many joints stand at one of their bounds; `law.limited` names them."""
         return int(self._results(kernel.LIMITED)[0])
+
+    @property
+    def protection_lost(self) -> float:
+        """Largest difference between the protected rate and what was asked for, rad/s (or m/s); 0 where it is kept.
+
+        Kept to rounding, that is: to 1e-9 of what joints and momentum do along the protected directions.
+        """
+        return float(self._results(kernel.LOST)[0])
+
+    @property
+    def protection_lost_to(self) -> tuple[str, ...]:
+        """Why the protected rate is not what was asked for, in words; nothing where it is."""
+        return lost_to(float(self._results(kernel.LOST_TO)[0]))
 
     @property
     def plan_change(self) -> float:
@@ -390,6 +416,13 @@ class SelectiveLaw(Settled):
     def momentum(self, momentum: ArrayLike | None) -> None:
         self._set_momentum(momentum)
 
+    def seen_from(self, origin: Floats) -> SelectiveLaw:
+        """Return the law for configurations whose base position is counted from another origin (3,), m.
+
+        It is this one: nothing in it depends on where the base is.
+        """
+        return self
+
     def _set_momentum(self, momentum: ArrayLike | None) -> None:
         values = np.zeros(6) if momentum is None else as_floats("momentum", momentum)
         if values.shape != (6,) or not np.all(np.isfinite(values)):
@@ -430,7 +463,7 @@ class SelectiveLaw(Settled):
     def _matrices_at(self, q: Floats) -> Floats:
         """Return the kernel's matrices (J_TASK + m, n) at q; they depend on no target."""
         model, data, _, (_, _, columns, _), fixed = self._prepared
-        pin.computeCentroidalMap(model, data, q)
+        pin.computeCentroidalMap(model, data, from_base(q))
         if self._reads_joints:
             kernel.read_joints(q, columns)
         matrices, drift, rates = np.zeros_like(self._matrices), np.zeros_like(self._drift), np.zeros(self.layout.size)
@@ -651,8 +684,21 @@ class SelectiveLaw(Settled):
             )
         if self.hold_nodes and status == kernel.OK:
             status = self._hold(q, np.asarray(target), np.asarray(target_velocity), np.asarray(previous_rates), out)
-        if status:
+        if status == kernel.FAR_AWAY:
+            self._evaluate_from_base(q, target, target_velocity, out, previous_rates)
+        elif status:
             self._refuse(q, target, target_velocity, previous_rates, out, status)
+
+    def _evaluate_from_base(
+        self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, out: Floats, previous: ArrayLike
+    ) -> None:
+        """Compute a command in inertial axes through the base origin, which is far from the inertial one."""
+        near = self.robot.checked(q).copy()
+        origin = near[:3].copy()
+        near[:3] = 0.0
+        targets, velocities = self._flat_vectors(target, target_velocity)
+        self.evaluate(near, self.layout.targets_from(origin, targets), velocities, out, previous)
+        out[6 + self._n + kernel.POSITION :][:3] += origin
 
     def _limited_command(
         self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, previous: ArrayLike, out: Floats
@@ -691,10 +737,10 @@ class SelectiveLaw(Settled):
         found = self._limited.joint_rates
         if found is plain:
             return
-        if scale is not None:  # take out what the rounding of the scaling leaves in the protected rows
-            J_sub = rows[:k] / scale
-            found = found - np.linalg.pinv(rows[:k]) @ (J_sub @ (scale * found) - self._limited.share * sides[:k])
-        kernel.take_rates(self._matrices, self._drift, U_c, columns, parameters, found, out)
+        if scale is not None:
+            self._step.take_out_rounding(rows[:k], scale, self._limited)
+        limited = self._limited.share < 1.0 - kernel.LOST_SHARE
+        kernel.take_rates(self._matrices, self._drift, U_c, columns, parameters, found, limited, out)
         results[kernel.EXCESS], results[kernel.LIMITED] = self._limited.excess, self._limited.count
 
     def check_start(self, q: ArrayLike) -> None:
@@ -737,7 +783,7 @@ class SelectiveLaw(Settled):
             q = self.robot.checked(q)
         if not (type(joint_rates) is array and joint_rates.dtype == np.float64 and joint_rates.shape == (self._n,)):
             joint_rates = self._checked_rates(joint_rates)
-        pin.computeCentroidalMap(model, data, q)
+        pin.computeCentroidalMap(model, data, from_base(q))
         kernel.base_twist_map(A_g, self._J_base)
         twist = self._J_base @ joint_rates
         momentum = parameters[kernel.MOMENTUM :]
@@ -785,12 +831,16 @@ class SelectiveLaw(Settled):
         Raises:
             InputError: q has the wrong length or is not finite.
         """
-        checked, scale = self.robot.checked(q), 1.0 / np.sqrt(self.joint_weights)
+        checked, scale = from_base(self.robot.checked(q)), 1.0 / np.sqrt(self.joint_weights)
         J = scale * self._task_jacobian(checked)[self.layout.level_rows[0]]
-        J_sub = scale * self.protection.J_sub(self.robot.coupling(checked))
+        coupling = self.robot.coupling(checked)
+        J_sub = scale * self.protection.J_sub(coupling)
+        first = 0 if self.protection.U_twist[:3].any() else 3
+        far = 1.0 + float(np.abs(self.robot.frame_pose(checked).translation).sum())
+        noise = kernel.NOISE * far * float(np.linalg.norm(scale * coupling.J_base[first:]))
 
         def left_by(rows: Floats) -> Floats:
-            return J - (J @ np.linalg.pinv(rows)) @ rows if len(rows) else J
+            return kernel.past_protected(np.ascontiguousarray(rows), np.ascontiguousarray(J), noise)
 
         direction = np.linalg.svd(left_by(J_sub))[0][:, -1]
         without = [float(np.linalg.norm(direction @ left_by(np.delete(J_sub, i, axis=0)))) for i in range(self._k)]
@@ -817,7 +867,8 @@ class SelectiveLaw(Settled):
             columns[kernel.RATE_STEP], parameters[kernel.LIMITS_STEPS] = 0.0, 1.0
             settings, last = (columns, parameters), velocity[6:].copy()
             status, change = self._plan(q, settings, target_velocity, last, out, previous)
-            kept[: kernel.POSITION] = results[: kernel.POSITION]
+            told = (*range(kernel.POSITION), kernel.LOST, kernel.LOST_TO)
+            kept[[*told]] = results[[*told]]
             results[:] = kept
         results[kernel.POSITION :][:3], errors[:] = kept_position, kept_errors  # as the base twist
         results[kernel.PLAN_CHANGE] = change

@@ -28,6 +28,9 @@ KINDS = {
 TOLERANCES = {"primal_tol": 1e-12, "dual_tol": 1e-12, "iter_limit": 500}
 LEAST = 1e-11  # weight of the rates beside that of what exceeds the acceleration limits
 KEPT = 1e-7  # share of the acceleration limits that is left for rounding there
+# Weight of the change of the rates, as kernel.STEADY, while joints or pairs of bodies are brought back inside their
+# limits: beside bounds that leave them hardly any way, the others would be thrown from limit to limit.
+RETURN_STEADY = 0.5
 
 
 @dataclass(frozen=True)
@@ -266,6 +269,7 @@ class LimitedStep:
         self._parameters: Floats = np.array([self.sample_time, limits.braking, distance, 0.0])
         self._steps: Floats = columns[kernel.ACCELERATION] * self.sample_time
         self._buffers: dict[tuple[Any, ...], _Buffers] = {}
+        self._last: _Buffers | None = None
         self._no_rows: tuple[Floats, Floats] = np.empty((0, n)), np.empty(0)
 
     def __call__(
@@ -314,7 +318,7 @@ class LimitedStep:
         buffers = self._buffers.get(key)
         if buffers is None:
             buffers = self._buffers[key] = self._fitting(key)
-        table, told = buffers.table, buffers.told
+        table, told, self._last = buffers.table, buffers.told, buffers
         self._parameters[kernel.NOISE] = noise
         status = kernel.prepare(
             self._columns,
@@ -349,6 +353,16 @@ class LimitedStep:
         near = buffers.sides[kernel.APART].copy() if len(distances) else None
         return LimitedRates(rates, self.robot.joint_names, bounds, near, share, excess, bool(told[kernel.STOPPABLE]))
 
+    def take_out_rounding(self, J_sub: Floats, scale: Floats, found: LimitedRates) -> None:
+        """Bring scale times the rates of the last step into null(J_sub / scale), or to what is wanted of it, in place.
+
+        J_sub (k, n) and its rank are those of the step: its rates, times `scale` (n,), have rounded once more.
+        """
+        assert self._last is not None
+        table, factors, told = self._last.table, self._last.factors, self._last.told
+        residual = (J_sub / scale) @ (scale * found.joint_rates) - found.share * factors[kernel.ATTAINED, : len(J_sub)]
+        kernel.take_out(residual, table, factors, int(told[kernel.RANK]), found.joint_rates)
+
     def _fitting(self, key: tuple[Any, ...]) -> _Buffers:
         """Return buffers for arguments of these shapes, which are checked once."""
         n = self.robot.n_joints
@@ -377,18 +391,19 @@ class LimitedStep:
             joints, pairs = np.flatnonzero(table[kernel.RETURN]), np.flatnonzero(buffers.sides[kernel.APART])
             J = np.vstack([np.eye(n)[joints], G[pairs]])
             v = np.r_[table[kernel.RETURN, joints], buffers.sides[kernel.APART, pairs]]
-            self._step(buffers, J, v, 0.0, 0.0, first - asked, n - first + asked, asked, rates)
+            self._step(buffers, J, v, 0.0, RETURN_STEADY, first - asked, n - first + asked, asked, rates)
             kernel.hold_return(table, buffers.sides, G, rates)
         if asked:
             length = told[kernel.LENGTH]
             direction = table[kernel.FIXED : kernel.FIXED + 1] / length
             # More than is wanted is asked for, and a bound keeps it to that: so no regularisation takes from it.
             self._step(buffers, direction, np.array([1.01 * length]), 0.0, 0.0, first - 1, 1, asked, rates)
+        steady = RETURN_STEADY if told[kernel.RETURNING] else kernel.STEADY
         for number, (J, v, rho) in enumerate(levels):
             if first == n:
                 break
             decided = int(told[kernel.COUNTS + number])
-            self._step(buffers, J, v, rho, kernel.STEADY, first, decided, 0, rates)
+            self._step(buffers, J, v, rho, steady, first, decided, 0, rates)
             first += decided
 
     def _step(

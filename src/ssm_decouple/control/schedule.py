@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -27,6 +28,8 @@ _OF_THE_BRIDGE: tuple[int | slice, ...] = (  # what a hand-over's results are, o
     kernel.PLAN_CHANGE,
     kernel.EXCESS,
     kernel.LIMITED,
+    kernel.LOST,
+    kernel.LOST_TO,
 )
 SHARED = 1e-12  # how far from 1 the cosine between two subspaces may be for a direction to count as in both
 
@@ -129,6 +132,20 @@ class Schedule(Settled):
         x = place - number
         return number, x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
 
+    def seen_from(self, origin: Floats) -> Schedule:
+        """Return the schedule for configurations whose base position is counted from another origin (3,), m."""
+        if self._progress is None:
+            return self
+        seen, progress = copy.copy(self), self._progress
+
+        def true_progress(time: float, q: Floats) -> float:
+            there = np.array(q, dtype=float)
+            there[:3] += origin
+            return progress(time, there)
+
+        seen._progress = true_progress
+        return seen
+
     def shared(self, number: int) -> Protection:
         """Return what the protection of that number and the next have in common: it stays protected in between."""
         first, second = (self.protections[i].U_twist for i in (number, number + 1))
@@ -225,6 +242,15 @@ class ScheduledLaw(SelectiveLaw):
         schedule = self.schedule
         told = [schedule.shares(*schedule.at(t, q)) for t, q in zip(time.tolist(), configurations, strict=True)]
         return np.array(told).reshape(len(time), schedule.k)
+
+    def seen_from(self, origin: Floats) -> ScheduledLaw:
+        """Return the law for configurations whose base position is counted from another origin (3,), m.
+
+        Its schedule goes on to look at the true ones; the scratch memory of both laws is one.
+        """
+        seen = copy.copy(self)
+        seen.schedule = self.schedule.seen_from(origin)
+        return seen
 
     def lost_direction(self, q: ArrayLike) -> LostDirection:
         """Refuse: it is a matter of one protection.

@@ -494,6 +494,15 @@ class Layout(Settled):
                 flat[start] = 1.0
         return flat
 
+    def targets_from(self, origin: Floats, targets: Floats) -> Floats:
+        """Return flat targets whose positions in inertial axes are counted from another origin (3,), m."""
+        moved = targets.copy()
+        for line in self.table:
+            if line[kernel.KIND] == kernel.POINTS and line[kernel.REFERENCE] < 0.0:
+                start, stride = int(line[kernel.TARGET]), int(line[kernel.STRIDE])
+                moved[start : start + 2 * stride + 1 : stride] -= origin
+        return moved
+
     def strange_target(self, targets: Floats) -> str:
         """Say which of flat targets is none: it is no rotation, or no direction."""
         for line in self.table:

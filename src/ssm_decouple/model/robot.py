@@ -25,6 +25,7 @@ from ssm_decouple.errors import (
 )
 from ssm_decouple.model.appendage import Appendage, Modes, checked_appendages, inspect_remaining_bus
 from ssm_decouple.model.locked import locked_urdf
+from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.payload import loaded_urdf, payload_body
 from ssm_decouple.model.urdf import inspect_urdf, parse_urdf, root_link, tip_links
 from ssm_decouple.model.wheels import Wheel, wheel_axes, wheeled_urdf
@@ -466,8 +467,34 @@ class Robot(Settled):
             raise InputError(
                 f"velocity needs {self.model.nv} finite numbers: base twist (6), joint rates ({self.n_joints})"
             )
-        pin.computeCentroidalMomentum(self.model, self._data, self.checked(q), velocity)
+        pin.computeCentroidalMomentum(self.model, self._data, from_base(self.checked(q)), velocity)
         return np.array(self._data.hg.vector)
+
+    @property
+    def wheel_inertias(self) -> Floats:
+        """Inertia of each reaction wheel about its axis (wheels,), kg m2, in the order of `wheel_names`."""
+        found = []
+        for name in self.wheel_names:
+            joint = self.model.joints[self.model.getJointId(name)]
+            axis = np.ravel(joint.createData().S)[3:]
+            found.append(float(axis @ self.model.inertias[joint.id].inertia @ axis))
+        return np.array(found)
+
+    @property
+    def wheel_torques(self) -> Floats:
+        """Largest torque of each reaction wheel's motor (wheels,), N m; infinite where it has no limit."""
+        efforts = np.array([self.model.effortLimit[6 + self.joint_index(name)] for name in self.wheel_names])
+        return np.where((efforts > 0) & (efforts < UNLIMITED), efforts, np.inf)
+
+    @property
+    def acceleration_limits(self) -> Floats:
+        """Largest joint accelerations (n,), rad/s2: of a reaction wheel max_torque / spin_inertia, else infinite.
+
+        A law keeps them if they are given as its `acceleration_limit`.
+        """
+        limits = np.full(self.n_joints, np.inf)
+        limits[[self.joint_index(name) for name in self.wheel_names]] = self.wheel_torques / self.wheel_inertias
+        return limits
 
     def report(self) -> Report:
         """Return what the robot is made of and what is suspicious in it; print it to read it."""

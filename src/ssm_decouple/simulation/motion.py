@@ -18,6 +18,7 @@ from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.errors import FileError, as_kind, as_path
 from ssm_decouple.files import is_file, written_whole
+from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.robot import Robot
 
 Floats = NDArray[np.float64]
@@ -370,8 +371,11 @@ def _audit(model: pin.Model, configurations: Floats, velocities: Floats) -> tupl
     data = model.createData()
     total, centre = data.hg, data.com[0]
     for i, (q, v) in enumerate(zip(configurations, velocities, strict=True)):
-        pin.computeCentroidalMomentum(model, data, q, v)
+        near = from_base(q)
+        pin.computeCentroidalMomentum(model, data, near, v)
         momenta[i], centres[i] = total.vector, centre
+        if near is not q:
+            centres[i] += q[:3]
     return momenta, centres
 
 

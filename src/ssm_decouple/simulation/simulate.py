@@ -28,9 +28,11 @@ from ssm_decouple.errors import (
     as_triple,
     shown,
 )
+from ssm_decouple.model.origin import far_origin
 from ssm_decouple.simulation.dynamic import DivergedError, Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import Outcome, build_motion, error_of, judge
 from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted, sample_times
+from ssm_decouple.simulation.telling import sentences, tell
 
 Floats = NDArray[np.float64]
 Method = Literal["explicit", "held", "rk4"]
@@ -131,6 +133,7 @@ def simulate(
     reference = _reference(law, target)
     demand = Demand(reference, _smooth_pace(smooth_start), _wanted(law, protected_rate, method))
     run = _Run(law, law.robot.checked(q).copy(), time, demand, method)
+    law, reference = run.law, run.demand.reference
     if law.layout.tool_target is not None:
         _warn_out_of_reach(law, run.configurations[0], reference(0.0)[0][law.layout.tool_target])
     law.check_start(run.configurations[0])
@@ -161,7 +164,10 @@ def simulate(
         if run.done:
             _give_motion(error, run)
         raise
-    return run.record()
+    motion = run.record()
+    for sentence in sentences(motion):
+        warnings.warn(sentence, DecoupleWarning, stacklevel=2)
+    return motion
 
 
 class _Run:
@@ -170,6 +176,11 @@ class _Run:
     def __init__(
         self, law: SelectiveLaw, start: Floats, time: Floats, demand: Demand, method: Method | Dynamic
     ) -> None:
+        # Where the base starts far away, all is computed from there, and the record is moved back.
+        self.origin = far_origin(start[:3])
+        if self.origin is not None:
+            law, demand = law.seen_from(self.origin), _seen_from(self.origin, law, demand)
+            start[:3] = 0.0
         self.law, self.time, self.demand, self.method = law, time, demand, method
         self.dynamic = DynamicMotion(method, law, start, time[1] - time[0]) if isinstance(method, Dynamic) else None
         # A command that is held speaks for the middle of its hold, one of the continuous law for its own time.
@@ -228,6 +239,9 @@ class _Run:
         motion = record(
             time, self.configurations[:done], self.values[:done], self.twists[:, :done], self.targets[:done]
         )
+        motion.attrs |= tell(motion, law, self.values[:done], self.configurations[0], self.dynamic is not None)
+        if self.origin is not None:
+            _move_back(motion, self.origin)
         outcome = self._judged(error_of(motion), self.settings["arrival_tolerance"])
         motion.attrs |= {
             "method": "dynamic" if self.dynamic is not None else self.method,
@@ -263,6 +277,25 @@ def _refuse_unfit_method(law: SelectiveLaw, method: Method | Dynamic, duration: 
         )
     if law.acceleration_limits is not None and method == "rk4":
         raise InputError("acceleration limits hold from sample to sample: use method 'held' or 'explicit', not 'rk4'")
+
+
+def _seen_from(origin: Floats, law: SelectiveLaw, demand: Demand) -> Demand:
+    """Return what is asked of the law, positions in inertial axes counted from another origin (3,), m."""
+
+    def reference(time: float) -> tuple[Floats, Floats]:
+        targets, velocities = demand.reference(time)
+        return law.layout.targets_from(origin, targets), velocities
+
+    return demand._replace(reference=reference)
+
+
+def _move_back(motion: xr.Dataset, origin: Floats) -> None:
+    """Count the positions of a record from the inertial origin again, of which `origin` (3,), m, was the start."""
+    for name in ("base_position", "end_effector_position", "target_position", "centre_of_mass"):
+        motion[name].values = motion[name].values + origin
+    configurations = motion.configuration.values.copy()
+    configurations[:, :3] += origin
+    motion["configuration"].values = configurations
 
 
 def _smooth_pace(duration: float) -> Pace:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -13,11 +14,12 @@ import numpy as np
 import xarray as xr
 
 from ssm_decouple.control.schedule import Schedule
-from ssm_decouple.errors import InputError, as_kind
+from ssm_decouple.errors import DecoupleWarning, InputError, as_kind
 from ssm_decouple.files import written_whole
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.motion import error_of, robot_of
 from ssm_decouple.simulation.replay import integral_along, rates_along
+from ssm_decouple.simulation.telling import sentences
 from ssm_decouple.studies.case import Case, checked_case
 
 LAWS = ("none", "selective", "reactionless")
@@ -57,6 +59,7 @@ class Summary:
         saturated: In a dynamic simulation, from when to when, s, a drive stood at its torque limit.
         full_wheels: Which reaction wheels were at full speed, and from when to when, in words.
         lost: Of a stalled motion the direction that its tasks could move least at the end, and what took it, in words.
+        told: What was promised and not kept, in words: see `simulate`.
     """
 
     case: str
@@ -83,6 +86,7 @@ class Summary:
     saturated: tuple[tuple[float, float], ...] = ()
     full_wheels: str = ""
     lost: str = ""
+    told: str = ""
 
 
 def summarise(motion: xr.Dataset, law: str) -> Summary:
@@ -130,6 +134,7 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         saturated=tuple((start, end) for start, end in json.loads(motion.attrs.get("saturated", "[]"))),
         full_wheels=full_wheels(motion),
         lost=lost_direction(motion),
+        told="; ".join(sentences(motion)),
     )
 
 
@@ -282,7 +287,10 @@ def compare_step_by_step(
     undamped = replace(checked_case(case), law={**case.law, "damping": 0.0})
 
     def run(law: str, variant: Case, protection: Protection | Schedule) -> xr.Dataset:
-        return variant.run(protection, dt, None if progress is None else lambda share: progress(law, share))
+        with warnings.catch_warnings():
+            if law != "selective":  # beside the case's own law the rows of the comparison tell
+                warnings.simplefilter("ignore", DecoupleWarning)
+            return variant.run(protection, dt, None if progress is None else lambda share: progress(law, share))
 
     for law, protection in laws_of(case).items():
         motion = run(law, case, protection)

@@ -170,6 +170,11 @@ def saturation(row: Summary) -> str | None:
     return drives if wheels is None else f"{drives} {wheels}"
 
 
+def not_kept(row: Summary) -> str | None:
+    """Say what was promised and not kept; None if all was."""
+    return f"{row.case}, {row.law}: {row.told}." if row.told else None
+
+
 def explain(row: Summary) -> str | None:
     """Say where and why a motion did not arrive; None if it did."""
     if row.outcome == "converged":
