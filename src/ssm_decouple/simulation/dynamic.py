@@ -27,12 +27,15 @@ from ssm_decouple.simulation.motion import (
     twist_along,
     wheel_momenta,
 )
-from ssm_decouple.simulation.steps import after_jump, between
 
 Floats = NDArray[np.float64]
 
 # Radians of the fastest motion in one physics step: there the integrator's own damping ratio is 2e-4.
 COARSEST = 0.5
+# Steps times the squared number of velocities that one compiled call does: some 0.2 s.
+STEP_WORK = 2_000_000
+# Of the servo's own time, 1 / (2 pi frequency), at most: so long a piece of a joint's path is a cubic to 1e-8 rad.
+PIECE = 1.5
 TINY = 1e-300  # keeps a share of nothing from being NaN
 
 # What a dynamic motion records beside the rest. name: (dimensions, unit, frame, meaning)
@@ -47,7 +50,17 @@ VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "load_work": (("time",), "J", "", "audit: work of the external wrench so far"),
     "damping_loss": (("time",), "J", "", "audit: energy lost in the hinges' dampers so far"),
     "saturated_time": (("time",), "s", "", "time so far in which a drive stood at its torque limit"),
+    "protected_angle_parts": (
+        ("time", "cause", "protected"),
+        "rad, or m and rad",
+        "U_c",
+        "what the protected angle is made of: the law's plan, the servo's errors, and what the model does not know",
+    ),
 }
+
+# Whose part of the protected angle stands where: of the commands, done at once from each sample on, by the law's model;
+# of the joints' motion beside them, by that model; of all that the model does not know. They add up to the truth.
+CAUSES = ("plan", "servo", "model")
 
 
 class DivergedError(FloatingPointError):
@@ -249,11 +262,15 @@ class DynamicMotion:
         self._law_moved: Floats = np.zeros(robot.model.nv)
         self.pose: Floats = np.r_[attitude.ravel(), q[:3]]
         self.reference: Floats = self.q[self.driven].copy()
-        self.torques: Floats = np.zeros((2, robot.n_joints))
+        self.drives: Floats = np.zeros((physics.DRIVES_SIZE, robot.n_joints))
+        self.torques: Floats = self.drives[: physics.LIMITED_TIME]
         self.totals: Floats = np.zeros(physics.TOTALS_SIZE)
         self.directions, self.axes = law.directions
-        self.measured: Floats = np.zeros(self.directions.shape[1])
-        self._samples: list[tuple[Floats, Floats, Floats, Floats]] = []
+        k = self.directions.shape[1]
+        self.parts: Floats = np.zeros((physics.PARTS_SIZE, k))
+        self.measured: Floats = np.zeros(k)
+        self._piece: Floats = np.zeros((5, robot.n_joints))
+        self._samples: list[tuple[Floats, ...]] = []
         self._noise = np.random.default_rng(settings.sensors.seed if settings.sensors else 0)
         self._limits = _torque_limits(robot, settings.servo)
         joints = np.vstack([self.plant.stiffness, self.plant.damping])
@@ -263,11 +280,26 @@ class DynamicMotion:
                 "a servo that protects holds one protection, fixed in base or inertial axes: no schedule and no axes "
                 f"of '{self.axes}'"
             )
-        spared = self.directions.copy() if protects else np.zeros((6, 0))
-        self._spared_motion: Floats = np.zeros(spared.shape[1])
-        trees = (*tree_of(self.plant.robot.model), joints, self.driven, *tree_of(robot.model))
-        self._constants = (*trees, self._limits, spared)
+        plant, own = tree_of(self.plant.robot.model), tree_of(robot.model)
+        self._on_board = law.momentum
+        self._differs = settings.load is not None or any(map(_differ, plant, own))
+        self._bodies, U = self._axes_of_directions()
+        self._constants = (*plant, joints, self.driven, *own, self._limits, U)
+        self._steps_at_once = max(1, STEP_WORK // (6 + self.q.size) ** 2)
         _refuse_coarse_step(settings, self.plant, self.start)
+
+    def _axes_of_directions(self) -> tuple[tuple[int, int], Floats]:
+        """Return the bodies, of plant and model, in whose axes the protected directions are, and those (6, k) there."""
+        if self.axes in ("base", "inertial"):
+            body = -1 if self.axes == "inertial" else 0
+            return (body, body), self.directions.copy()
+        model = self.law.robot.model
+        held = model.frames[self.law.robot.frame_id(self.axes)]
+        R = held.placement.rotation
+        turned = np.vstack([R @ self.directions[:3], R @ self.directions[3:]])
+        if held.parentJoint == 1:
+            return (0, 0), turned
+        return (self.plant.robot.model.getJointId(model.names[held.parentJoint]) - 1, held.parentJoint - 1), turned
 
     def _positions(self, q: Floats) -> Floats:
         return pin.difference(self.plant.robot.model, pin.neutral(self.plant.robot.model), q)[6:]
@@ -296,10 +328,6 @@ class DynamicMotion:
     def _law_configuration(self, positions: Floats) -> Floats:
         return self._with_base(self.law.robot.model, self._law_moved, positions)
 
-    def _law_velocity(self) -> Floats:
-        """Return the velocity of the law's robot (nv,): base twist in base axes, then joint rates."""
-        return np.r_[self.v[:6], self.v[6 + self.driven]]
-
     def correction(self) -> Floats | None:
         """Return the rate b (k,) about the protected directions that takes back what the gyros have told."""
         return -self.settings.feedback_gain * self.measured if self.settings.feedback_gain else None
@@ -308,50 +336,58 @@ class DynamicMotion:
         """Hold commanded joint rates (n,) from t to t_next.
 
         Returns:
-            The configuration of the law's robot (nq,) then, and the integral of the base twist (2, 6), in base axes
-            and in those of the law's directions.
+            The configuration of the law's robot (nq,) then, and the integral of the base twist (6,), base axes, twice.
 
         Raises:
             DivergedError: the motion has run away; the message says when.
         """
         held, before = _holding(self.settings, t, t_next), self.totals[:6].copy()
-        start, first = self._law_configuration(self.q[self.driven]), self._law_velocity()
-        held[physics.INERTIAL] = float(self.axes == "inertial")
-        bad = physics.advance(
-            *self._constants,
-            held,
-            np.ascontiguousarray(rates),
-            self.reference,
-            self.torques,
-            self._spared_motion,
-            self.q,
-            self.v,
-            self.pose,
-            self.totals,
-        )
-        if bad != physics.OK:
-            raise DivergedError(f"{t + bad * held[physics.STEP]:.6g}")
+        held[physics.AXES], held[physics.OWN_AXES] = self._bodies
+        held[physics.MOMENTUM :] = on_board = self.law.momentum
+        held[physics.DIFFERS] = float(self._differs or not np.array_equal(on_board, self._on_board))
+        told = self.parts[physics.TRUTH].copy()
+        steps, piece = int(held[physics.STEPS]), int(held[physics.STEPS_PER_PIECE])
+        # A call at a time of no more than a moment: in between Python hears Ctrl-C.
+        at_once = max(1, self._steps_at_once // piece) * piece
+        rates = np.ascontiguousarray(rates)
+        for first in range(0, steps, at_once):
+            held[physics.FIRST], held[physics.LAST] = first, min(first + at_once, steps)
+            bad = physics.advance(
+                *self._constants,
+                held,
+                rates,
+                self.reference,
+                self.drives,
+                self.parts,
+                self._piece,
+                self.q,
+                self.v,
+                self.pose,
+                self.totals,
+            )
+            if bad != physics.OK:
+                raise DivergedError(f"{t + bad * held[physics.STEP]:.6g}")
+        self._measure(self.parts[physics.TRUTH] - told, t_next - t)
         twist = self.totals[:6] - before
-        self._measure(twist, t_next - t)
-        end, dt = self._law_configuration(self.q[self.driven]), t_next - t
-        velocities = np.array([first, self._law_velocity()])
-        if self.settings.servo is None:
-            velocities = after_jump(velocities, rates, twist, dt)
-        return end, np.array([twist, between(self.law, np.array([start, end]), velocities, twist, dt)])
+        # The record takes what is along the directions from `parts`, summed at each step of the physics.
+        return self._law_configuration(self.q[self.driven]), np.array([twist, twist])
 
     def sample(self) -> None:
         """Remember the state for the record."""
-        self._samples.append((self.configuration(), self.v.copy(), self.torques[0].copy(), self.totals.copy()))
+        kept = (self.v, self.drives[physics.TORQUE], self.totals, self.parts)
+        self._samples.append((self.configuration(), *(part.copy() for part in kept)))
 
-    def _measure(self, twist: Floats, dt: float) -> None:
-        told, sensors = twist.copy(), self.settings.sensors
+    def _measure(self, turned: Floats, dt: float) -> None:
+        """Add to what the gyros have told: how far the base has moved along the protected directions (k,), and noise.
+
+        The gyros' rates are turned into the axes of the directions as they are measured, not at the sample.
+        """
+        told, sensors = turned.copy(), self.settings.sensors
         if sensors is not None:
-            told[3:] += sensors.gyro_noise * dt * self._noise.standard_normal(3)
-        turned = rotations_to(self.law.robot, self.axes, self._law_configuration(self.q[self.driven])[None])
-        if turned is not None:
-            R = turned[0]
-            told = np.r_[R @ told[:3], R @ told[3:]]
-        self.measured += self.directions.T @ told
+            noise = sensors.gyro_noise * dt * self._noise.standard_normal(3)
+            axes = rotations_to(self.law.robot, self.axes, self._law_configuration(self.q[self.driven])[None])
+            told += self.directions[3:].T @ (noise if axes is None else axes[0] @ noise)
+        self.measured += told
 
     def record(self, time: Floats, seen: Floats, values: Floats, twists: Floats, targets: Floats) -> xr.Dataset:
         """Return what `build_motion` makes of the law's robot and commands, with the truth about the plant in it.
@@ -359,7 +395,7 @@ class DynamicMotion:
         Velocities, momentum and end-effector are the plant's, and the drives, the appendages and the energy are further
         variables. The arguments are those of `build_motion`.
         """
-        configurations, velocities, torques, totals = (
+        configurations, velocities, torques, totals, parts = (
             np.array(part) for part in zip(*self._samples[: len(time)], strict=True)
         )
         momenta, centres, points, energies, carried = self._audit(configurations, velocities)
@@ -367,6 +403,7 @@ class DynamicMotion:
         hinges = np.array([self._positions(q) for q in configurations])[:, self.plant.hinges]
         spring = 0.5 * hinges**2 @ self.plant.stiffness[self.plant.hinges]
         replaced = {
+            "protected_angle": parts[:, physics.TRUTH],
             "protected_rate": twist_along(
                 self.directions, self.axes, velocities[:, :6], motion.configuration.values, self.law.robot
             ),
@@ -387,8 +424,11 @@ class DynamicMotion:
         motion = motion.assign_coords(
             hinge=[names[place] for place in self.plant.hinges],
             appendage=[appendage.name for appendage in self.plant.appendages],
+            cause=list(CAUSES),
         )
+        plan, model = parts[:, physics.PLAN], parts[:, physics.MODEL]
         added = {
+            "protected_angle_parts": np.stack([plan, model - plan, parts[:, physics.TRUTH] - model], axis=1),
             "joint_velocities": velocities[:, 6 + self.driven],
             "joint_torques": torques,
             "hinge_angles": hinges,
@@ -416,8 +456,14 @@ class DynamicMotion:
             "momentum_drift": float(np.max(drift / carried)),
             "largest_torques": json.dumps(self.torques[1].tolist()),
             "saturated": json.dumps(flagged_spans(motion.time.values, np.diff(totals[:, physics.SATURATED]) > 0)),
+            "saturated_joints": json.dumps(self._saturated_joints(float(time[-1] - time[0]))),
         }
         return motion
+
+    def _saturated_joints(self, duration: float) -> dict[str, float]:
+        """Return for each joint whose drive was at its torque limit the share of the time in which it was."""
+        times = self.drives[physics.LIMITED_TIME] / max(duration, TINY)
+        return {name: float(share) for name, share in zip(self.law.robot.joint_names, times, strict=True) if share > 0}
 
     def _audit(self, configurations: Floats, velocities: Floats) -> tuple[Floats, Floats, Floats, Floats, Floats]:
         """Return momenta (m, 6), centres of mass, end-effector (m, 3) and kinetic energy (m,) by Pinocchio.
@@ -448,15 +494,23 @@ def _holding(settings: Dynamic, t: float, t_next: float) -> Floats:
     held = np.zeros(physics.SETTINGS_SIZE)
     held[physics.STEP], held[physics.STEPS] = dt / steps, steps
     held[physics.STEPS_PER_TORQUE] = 1 if servo is None or servo.period is None else each
+    held[physics.STEPS_PER_PIECE] = steps
     if servo is None:
         held[physics.PRESCRIBED] = 1.0
     else:
+        held[physics.PROTECTS] = float(servo.protects)
+        longest = PIECE / (2 * np.pi * servo.frequency)
+        held[physics.STEPS_PER_PIECE] = max(1, min(steps, int(longest / dt * steps)))
         held[physics.FREQUENCY], held[physics.RATIO] = 2 * np.pi * servo.frequency, servo.damping_ratio
     if settings.load is not None:
         ends = np.array([settings.load.start, settings.load.start + settings.load.duration])
         held[physics.LOAD_FROM : physics.LOAD_TO + 1] = np.clip(np.round((ends - t) / dt * steps), 0, steps)
-        held[physics.LOAD : physics.INERTIAL] = *settings.load.force, *settings.load.torque
+        held[physics.LOAD : physics.PROTECTS] = *settings.load.force, *settings.load.torque
     return held
+
+
+def _differ(one: NDArray[Any], other: NDArray[Any]) -> bool:
+    return not np.array_equal(one, other)
 
 
 def _torque_limits(robot: Robot, servo: Servo | None) -> Floats:
