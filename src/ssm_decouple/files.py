@@ -1,7 +1,9 @@
-"""Writing result files whole or not at all."""
+"""Writing result files whole or not at all, and on the disk before anything says that they are."""
 
 from __future__ import annotations
 
+import filecmp
+import logging
 import os
 import tempfile
 from collections.abc import Iterator
@@ -9,6 +11,9 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from ssm_decouple.errors import FileError
+
+LOG = logging.getLogger(__name__)  # at level INFO, each file that something else is written over
+PARTIAL = ".partial"  # what the name of a file ends in until it is whole
 
 
 def writable_folder(folder: str | Path) -> Path:
@@ -22,9 +27,9 @@ def writable_folder(folder: str | Path) -> Path:
         path.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=path):
             pass
-    except OSError as error:
+    except (OSError, ValueError) as error:
         raise FileError(
-            f"cannot write to the folder '{path}': {error.strerror or error}; choose another with --output"
+            f"cannot write to the folder '{path}': {_reason(error)}; choose another with --output"
         ) from error
     return path
 
@@ -41,18 +46,29 @@ def is_file(path: Path) -> bool:
 def written_whole(path: str | Path) -> Iterator[Path]:
     """Give a temporary name beside `path`; what was written there takes its place only if all went well.
 
+    It is on the disk before it takes that place. Where that was another's, the logger of this module says so.
+
     Raises:
-        FileError: the place cannot be written.
+        FileError: the place cannot be written, or is no place for a file.
     """
-    final = Path(path)
+    final, temporary = Path(path), None
     if not final.name:
         raise FileError(f"cannot write '{final}': it names no file")
-    temporary = final.with_name(f".{final.stem}.{os.getpid()}.part{final.suffix}")
     try:
+        if final.exists():
+            _refuse_unfit(final)
+        # A name that fits wherever the final one does, with its suffix, by which writers know the format.
+        temporary = final.with_name(f".{final.stem[:64]}.{os.getpid()}.part{final.suffix}")
         yield temporary
+        synced(temporary)
+        changed = final.exists() and not filecmp.cmp(final, temporary, shallow=False)
         os.replace(temporary, final)
-    except OSError as error:
-        raise FileError(f"cannot write '{final}': {error.strerror or error}") from error
+        synced(final.parent)
+    except (OSError, ValueError) as error:
+        if isinstance(error, FileError) or (isinstance(error, ValueError) and temporary is not None):
+            raise
+        raise FileError(f"cannot write '{final}': {_reason(error)}") from error
     finally:
-        with suppress(OSError):  # a name too long for a file, told above
-            temporary.unlink(missing_ok=True)
+        if temporary is not None:
+            with suppress(OSError):  # a name too long for a file, told above
+                temporary.unlink(missing_ok=True)

@@ -4,7 +4,6 @@ The oracle integrates the momentum law by scipy's DOP853, with matrices from Pin
 and shares nothing with the package but the model.
 """
 
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -99,7 +99,8 @@ class CommandedMotion:
         """Constrained disturbance angular velocity w_sub = J_sub q_dot (.., k), rad/s (paper, eq. 6): rounding.
 
         Of a law with hold nodes, its mean over the hold. Where a rate was asked for it is that rate, or what of it the
-        arm and its rate limits can give; so it is with zero where there is momentum on board. With directions of the whole twist it mixes m/s and rad/s.
+        arm and its rate limits can give; so it is with zero where there is momentum on board. With directions of the
+        whole twist it mixes m/s and rad/s.
         """
         return self._results(kernel.PROTECTED_RATE, self.k)
 

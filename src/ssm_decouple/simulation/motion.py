@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
+import os
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -16,7 +20,7 @@ from numpy.typing import NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import FileError, as_kind, as_path
+from ssm_decouple.errors import DecoupleWarning, FileError, InputError, as_kind, as_path
 from ssm_decouple.files import is_file, written_whole
 from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.robot import Robot
@@ -411,32 +415,146 @@ def _attributes(law: SelectiveLaw) -> dict[str, Any]:
 def save_motion(motion: xr.Dataset, path: str | Path) -> Path:
     """Write a motion to a netCDF file, whole or not at all.
 
+    Its numbers carry HDF5's own checksums (fletcher32), which any reader heeds, and behind the end of the HDF5 file,
+    where readers do not look, stands the SHA-256 of all its bytes, by which `load_motion` sees that it is as written.
+
     Raises:
+        InputError: it is no dataset, or holds what netCDF cannot.
         FileError: the place cannot be written.
         InputError: it is no motion, or no path.
     """
     as_kind("motion", motion, xr.Dataset, "give what simulate(..) or load_motion(..) returns")
     final = as_path("path", path)
+    content = _netcdf(motion)  # not written to the disk by HDF5, which does not survive that the disk is full
     with written_whole(final) as temporary:
-        motion.to_netcdf(temporary, engine="h5netcdf")
+        temporary.write_bytes(content + _SEAL + hashlib.sha256(content).hexdigest().encode() + b"\n")
     return final
 
 
 def load_motion(path: str | Path) -> xr.Dataset:
     """Read a motion from a netCDF file.
 
+    What `save_motion` has written is verified first. A file without its checksum, which another program or an earlier
+    version has written, is read as HDF5 lets it, and a warning says so.
+
     Raises:
-        FileError: no such file, not netCDF, or not a motion of this package; what is missing is named.
+        FileError: no such file, not netCDF, damaged, or not a motion of this package; what is missing is named.
     """
     path = as_path("path", path)
     if not is_file(path):
         raise FileError(f"no motion at '{path}': not a file")
     try:
+        verified = _verify(Path(path))
         with xr.open_dataset(path, engine="h5netcdf") as opened:
             motion = opened.load()
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FileError(f"'{path}' is not a netCDF file: {error}") from error
+    except FileError:
+        raise
+    except Exception as error:  # HDF5 and its readers raise all kinds
+        told = (isinstance(error, OSError) and error.strerror) or str(error)
+        raise FileError(f"'{path}' is not a netCDF file: {told}") from error
+    _refuse_other(motion, path)
+    if not verified:
+        warnings.warn(
+            f"'{path}' has no checksum, so that damage to it may go unseen: save_motion writes one",
+            DecoupleWarning,
+            stacklevel=2,
+        )
+    return motion
+
+
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_SEAL = b"\nssm-decouple sha256 "  # between HDF5's end and the digest
+_DIGEST = 64 + 1  # characters, with the line's end
+_CHUNK = 2**17  # numbers that carry one checksum
+_DEFLATED = 1032  # times smaller than itself is the most that HDF5's usual compression can make anything
+
+
+def _netcdf(motion: xr.Dataset) -> bytes:
+    """Return a motion as the bytes of a netCDF file."""
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
+    if not isinstance(motion, xr.Dataset):
+        raise InputError(f"{type(motion).__name__} is no motion; give what simulate(..) or load_motion(..) returns")
+    written, content = motion.copy(deep=False), io.BytesIO()
+    for variable in written.variables.values():
+        variable.encoding = _encoding(variable)
+    try:
+        with h5netcdf.File(content, "w") as file:
+            written.dump_to_store(H5NetCDFStore(file))
+    except (TypeError, ValueError, KeyError, AttributeError, RuntimeError, OSError) as error:
+        raise InputError(f"the motion holds what netCDF cannot: {error}") from error
+    return content.getvalue()
+
+
+def _encoding(variable: xr.Variable) -> dict[str, Any]:
+    """Say how a variable is written: numbers with checksums, which HDF5 has for chunks alone."""
+    if variable.dtype.kind not in "fiub" or not variable.ndim or not variable.size:
+        return {}
+    rows, *others = variable.shape
+    parts = -(-variable.size // _CHUNK)
+    return {"fletcher32": True, "chunksizes": (-(-rows // parts), *others)}
+
+
+def _verify(path: Path) -> bool:
+    """Say whether a file has a checksum; refuse one whose bytes are not those that were written.
+
+    HDF5's end stands at its beginning: what is behind it is a checksum, whole or damaged.
+    """
+    with path.open("rb") as file:
+        size, head = os.fstat(file.fileno()).st_size, file.read(64)
+        if not head.startswith(_SIGNATURE):
+            raise FileError(f"'{path}' is not a netCDF file: it is {'empty' if not size else 'no HDF5 file'}")
+        whole = max(0, size - len(_SEAL) - _DIGEST)
+        file.seek(whole)
+        seal = file.read()
+        if seal.startswith(_SEAL):
+            if _sha256(file, whole) != seal[len(_SEAL) : -1]:
+                raise FileError(f"'{path}' is damaged: its bytes are not those that were written")
+            return True
+        if _hdf5_end(head) not in (None, size):
+            raise FileError(f"'{path}' is damaged: its end is not where it was written")
+    _refuse_absurd(path, size)
+    return False
+
+
+def _sha256(file: BinaryIO, size: int) -> bytes:
+    """Return the digest, in hexadecimal, of so many bytes from the beginning of a file."""
+    file.seek(0)
+    found = hashlib.sha256()
+    while size > 0 and (part := file.read(min(size, 2**20))):
+        found.update(part)
+        size -= len(part)
+    return found.hexdigest().encode()
+
+
+def _hdf5_end(head: bytes) -> int | None:
+    """Return where HDF5's superblock says that the file ends; None where it is of a kind that is not known here."""
+    version = head[8] if len(head) == 64 else None
+    if version in (0, 1) and head[13] == 8:
+        start = 40 + 4 * version
+    elif version in (2, 3) and head[9] == 8:
+        start = 28
+    else:
+        return None
+    return int.from_bytes(head[start : start + 8], "little")
+
+
+def _refuse_absurd(path: Path, size: int) -> None:
+    """Refuse a file without a checksum that says that it holds more than its bytes can."""
+    import h5py
+
+    with h5py.File(path) as file:
+        claimed: list[int] = []
+        file.visititems(lambda _, item: claimed.append(item.nbytes if isinstance(item, h5py.Dataset) else 0))
+    if sum(claimed) > _DEFLATED * size:
+        raise FileError(f"'{path}' is damaged: it claims to hold {sum(claimed) / 1e9:.3g} GB in {size / 1e6:.3g} MB")
+
+
+def _refuse_other(motion: xr.Dataset, path: str | Path) -> None:
+    """Refuse a netCDF file that is no motion."""
     missing = [name for name in _VARIABLES if name not in motion.variables]
+    missing += [f"the attribute {name}" for name in ("robot", "end_effector", "law") if name not in motion.attrs]
     if missing:
         raise FileError(
             f"'{path}' is netCDF but not a motion: it lacks {', '.join(missing[:4])}{', ..' if missing[4:] else ''}"
@@ -444,4 +562,5 @@ def load_motion(path: str | Path) -> xr.Dataset:
     for name, (dimensions, *_) in _VARIABLES.items():
         if motion[name].dims != dimensions:
             raise FileError(f"'{path}' is no motion: {name} has dimensions {motion[name].dims}, expected {dimensions}")
-    return motion
+        if name != "robot_urdf" and motion[name].dtype.kind != "f":
+            raise FileError(f"'{path}' is no motion: {name} is of {motion[name].dtype}, not of numbers")
