@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import filecmp
 import logging
 import os
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
@@ -72,3 +73,65 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         if temporary is not None:
             with suppress(OSError):  # a name too long for a file, told above
                 temporary.unlink(missing_ok=True)
+    if changed:
+        LOG.info("%s", final)
+
+
+def write_all_whole(files: Mapping[Path, bytes]) -> None:
+    """Write files, each whole or not at all, all of them on the disk when this returns.
+
+    All are written before the first is forced to the disk, so that most of them are on their way by then. What a kill
+    leaves of them has `PARTIAL` behind its name.
+
+    Args:
+        files: Contents by path; the folders are made.
+
+    Raises:
+        OSError: the place cannot be written.
+    """
+    partial = {path: path.with_name(path.name + PARTIAL) for path in files}
+    for path, content in files.items():
+        _make_folder(path.parent)
+        partial[path].write_bytes(content)
+    for place in partial.values():
+        synced(place)
+    for path, place in partial.items():
+        os.replace(place, path)
+    for folder in {path.parent for path in files}:
+        synced(folder)
+
+
+def synced(path: Path) -> None:
+    """Force a file or a folder to the disk.
+
+    Raises:
+        OSError: that fails.
+    """
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    except OSError as error:
+        if error.errno not in (errno.EINVAL, errno.ENOTSUP):  # a file system that cannot, such as some over a network
+            raise
+    finally:
+        os.close(handle)
+
+
+def _make_folder(folder: Path) -> None:
+    """Make a folder and those above it, on the disk too."""
+    if not folder.is_dir():
+        _make_folder(folder.parent)
+        folder.mkdir()
+        synced(folder.parent)
+
+
+def _refuse_unfit(place: Path) -> None:
+    """Refuse what a file must not take the place of: a folder, a device, a pipe, what is write-protected."""
+    if not place.is_file():
+        raise FileError(f"cannot write '{place}': it is {'a folder' if place.is_dir() else 'no regular file'}")
+    if not os.access(place, os.W_OK):
+        raise FileError(f"cannot write '{place}': it is write-protected")
+
+
+def _reason(error: Exception) -> str:
+    return (isinstance(error, OSError) and error.strerror) or str(error)
