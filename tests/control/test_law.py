@@ -229,7 +229,7 @@ def test_the_kernel_uncompiled_gives_the_same(robot, rng, axes):
             plain = np.full(law.size, np.nan)
             model, data, *_, fixed = law._prepared
             pin.computeCentroidalMap(model, data, q)
-            status = uncompiled_command(*fixed, target, velocity, np.zeros(robot.n_joints), plain)
+            status = uncompiled_command(*fixed, target, velocity, np.zeros(robot.n_joints), plain, q)
             assert status == kernel.OK
             np.testing.assert_allclose(plain, compiled, rtol=1e-9, atol=1e-13)
 

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_positive
+from ssm_decouple.errors import InputError, as_floats, as_number
 
 Floats = NDArray[np.float64]
 
@@ -93,8 +93,12 @@ def selective_rates(
             f"rate_limits are {limits.tolist()} and joint_weights {weights.tolist()}; all must be above zero, the "
             "weights finite"
         )
-    damping = as_not_negative("damping", damping)
-    damping_threshold = as_positive("damping_threshold", damping_threshold)
+    damping, damping_threshold = as_number("damping", damping), as_number("damping_threshold", damping_threshold)
+    if not (damping >= 0.0 and damping_threshold > 0.0):
+        raise InputError(
+            f"damping is {damping} and damping_threshold {damping_threshold}; the first must be zero or more and the "
+            "second above zero"
+        )
     rates = _output(out, (n,))
     scale = 1.0 / np.sqrt(weights)
     if kernel.rates_of(rows, task, velocity, wanted, limits, scale, damping, damping_threshold, rates) != kernel.OK:

@@ -16,7 +16,7 @@ from ssm_decouple.control.task import RateTask
 from ssm_decouple.errors import InputError, as_floats, as_items, as_kind, as_number, as_positive, shown
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
-from ssm_decouple.settled import Settled, fixed_array
+from ssm_decouple.settled import Settled, fixed, fixed_array
 
 Floats = NDArray[np.float64]
 Progress = Callable[[float, Floats], float]
@@ -88,7 +88,7 @@ class Schedule(Settled):
             raise InputError(f"the protections of a schedule need the same frame, not {', '.join(frames)}")
         self.frame = frames[0] if frames else "base"
         found: list[Floats] = []
-        self.rows = tuple(tuple(_place(found, column) for column in p.U_twist.T) for p in self.protections)
+        self.rows = tuple(fixed([_place(found, column) for column in p.U_twist.T]) for p in self.protections)
         self.U_twist: Floats = fixed_array(np.array(found).reshape(-1, 6).T)
         self.k: int = len(found)
 
@@ -314,7 +314,7 @@ class ScheduledLaw(SelectiveLaw):
                 f"protected_rate is {shown(rate.tolist())}; it needs {self.schedule.k} finite numbers, one a direction "
                 "of the schedule"
             )
-        return [rate[list(rows)] for rows in self.schedule.rows]
+        return [rate[rows] for rows in self.schedule.rows]
 
     def _bridge(self, number: int, wanted: list[Floats | None]) -> Floats:
         """Return what is asked for along the rows that a protection and the next share."""

@@ -18,7 +18,6 @@ from ssm_decouple.errors import (
     ModelError,
     as_floats,
     as_kind,
-    as_number,
     as_text,
     as_whole,
     shown,
@@ -345,7 +344,10 @@ class Robot(Settled):
         displacement = np.zeros(self.model.nv)
         if isinstance(joints, Mapping):
             for name, value in joints.items():
-                displacement[6 + self.joint_index(name)] = as_number(f"joint position {name}", value)
+                position = as_floats(f"joint position {name}", value)
+                if position.shape != ():
+                    raise InputError(f"joint position {name} is {shown(value)}; it needs one number")
+                displacement[6 + self.joint_index(name)] = position
         elif joints is not None:
             values = as_floats("joint positions", joints)
             if values.shape != (self.n_joints,):

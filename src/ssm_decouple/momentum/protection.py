@@ -54,7 +54,8 @@ class Protection(Settled):
     """
 
     def __init__(self, axes: ArrayLike | str, frame: str = "base") -> None:
-        frame = as_text("frame", frame, "it is 'base', 'inertial' or the name of a frame of the robot")
+        if not (isinstance(frame, str) and frame.strip()):
+            raise InputError(f"frame is 'base', 'inertial' or the name of a frame of the robot, not {shown(frame)}")
         given = _named(axes) if isinstance(axes, str) else _columns(axes)
         _refuse_far_from_orthonormal(given)
         self.frame: str = frame
@@ -99,7 +100,10 @@ class Protection(Settled):
         Raises:
             InputError: not of this shape, not finite, or nothing but zeros.
         """
-        given = as_floats("participation", participation)
+        try:
+            given = as_floats("participation", participation)
+        except InputError:
+            raise InputError(f"participation vectors cannot be read as numbers: {shown(participation)}") from None
         columns = given[:, None] if given.ndim == 1 else given
         if columns.ndim != 2 or columns.shape[0] != 6:
             raise InputError(
