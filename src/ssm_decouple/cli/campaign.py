@@ -31,6 +31,7 @@ campaign = typer.Typer(
 )
 
 StorePath = Annotated[Path, typer.Argument(metavar="STORE", help="Folder of the campaign's store.")]
+MEND = "'ssm-decouple campaign run FILE --output STORE --resume' computes it again"
 LOG_EVERY = 30.0  # s between lines where there is no terminal
 
 
@@ -99,6 +100,32 @@ def status(store: StorePath, as_json: AsJson = False) -> None:
     typer.echo(f"cases {', '.join(found.cases)}; protections {', '.join(found.protections)}")
     typer.echo(f"computed by {', '.join(f'{name} {version}' for name, version in found.versions.items())}")
     typer.echo(f"campaign {found.sha256}")
+    for fault in found.damaged:
+        typer.echo(f"damaged: {fault}")
+    if found.damaged:
+        typer.echo(MEND)
+
+
+@campaign.command()
+def verify(store: StorePath, as_json: AsJson = False) -> None:
+    """Read all that a store holds and say what of it is damaged or lost. Exit status 1 if anything is.
+
+    'campaign run' with --resume mends it: it computes again what is not as it was written.
+    """
+    from ssm_decouple.studies.store import Store
+
+    found = Store.open(store)
+    faults, there = found.damage(), found.rows_there()
+    if as_json:
+        told = {"checksums": found.checked, "samples": len(there), "there": int(there.sum()), "damaged": faults}
+        typer.echo(json.dumps(told, indent=2))
+    else:
+        for fault in faults:
+            typer.echo(f"damaged: {fault}")
+        how = "as they were written" if found.checked else "readable; without checksums no more can be said"
+        typer.echo(MEND if faults else f"{there.sum()} of {len(there)} samples are there, all {how}")
+    if faults:
+        raise typer.Exit(1)
 
 
 @campaign.command()
@@ -112,7 +139,10 @@ def summary(
     from ssm_decouple.studies.store import Store
     from ssm_decouple.viewing.table import plain
 
-    tallies = Store.open(store).tallies()
+    kept = Store.open(store)
+    tallies, there = kept.tallies(), kept.rows_there()
+    if not there.all():
+        complain(f"{len(there) - there.sum()} of {len(there)} samples are not there; --resume goes on with them")
     if csv is not None and tallies:
         write_csv(tallies, csv)
     if as_json:
@@ -156,7 +186,10 @@ def rerun(
     kept = Store.open(store)
     found = kept.campaign
     case, protection, draw = found.place(sample)
-    stored = kept.row(sample)
+    fault = kept.fault_of(sample)
+    if fault is not None:
+        complain(f"[bold yellow]warning:[/] the chunk is not as it was written: {escape_markup(fault)}")
+    stored = kept.row(sample, though_damaged=fault is not None)
     again = {name: values[0] for name, values in found.rows([sample]).items()}
     same = all(_same(stored[name], again[name]) for name in stored)
     computed, path = _motion_of(found, sample, output)
