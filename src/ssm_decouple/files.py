@@ -90,13 +90,18 @@ def write_all_whole(files: Mapping[Path, bytes]) -> None:
         OSError: the place cannot be written.
     """
     partial = {path: path.with_name(path.name + PARTIAL) for path in files}
-    for path, content in files.items():
-        _make_folder(path.parent)
-        partial[path].write_bytes(content)
-    for place in partial.values():
-        synced(place)
-    for path, place in partial.items():
-        os.replace(place, path)
+    try:
+        for path, content in files.items():
+            _make_folder(path.parent)
+            partial[path].write_bytes(content)
+        for place in partial.values():
+            synced(place)
+        for path, place in partial.items():
+            os.replace(place, path)
+    except BaseException:
+        for place in partial.values():
+            place.unlink(missing_ok=True)
+        raise
     for folder in {path.parent for path in files}:
         synced(folder)
 

@@ -339,7 +339,7 @@ class Campaign(Settled):
         progress: Callable[[int, int], object] | None = None,
         note: Callable[[str], object] | None = None,
     ) -> xr.Dataset:
-        """Compute every sample that a store does not hold yet, chunk by chunk.
+        """Compute every sample that a store does not hold yet, or not whole, chunk by chunk.
 
         Args:
             store: Folder of the Zarr store.
@@ -347,7 +347,8 @@ class Campaign(Settled):
             scheduler: Address of a Dask scheduler, whose workers compute instead.
             resume: Go on with a store that is there.
             progress: Called after each chunk with the number of samples that are there, and of all.
-            note: Called with lines that a user may want to read: a cluster's dashboard, a worker that died.
+            note: Called with lines that a user may want to read: a cluster's dashboard, a worker that died, what of
+                the store was damaged and is made again.
 
         Returns:
             The store, opened by xarray.
@@ -368,7 +369,10 @@ class Campaign(Settled):
             with interrupts.held():
                 kept = open_things.enter_context(Store.writing(store, self, resume))
                 todo, there = kept.missing(), kept.samples_done
-            pool = pool_of(self, workers, scheduler, note or (lambda _: None))
+            note = note or (lambda _: None)
+            for fault in kept.mended:
+                note(f"damaged, and made again: {fault}")
+            pool = pool_of(self, workers, scheduler, note)
             if progress is not None:
                 progress(there, self.size)
             results = open_things.enter_context(closing(pool.results(todo)))
