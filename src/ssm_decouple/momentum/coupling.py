@@ -61,7 +61,7 @@ class Coupling:
         Raises:
             InputError: q has the wrong length or is not finite.
         """
-        model, data, configuration = robot.model, robot.model.createData(), robot.checked(q).copy()
+        model, data, configuration = robot.model, pin.Data(robot.model), robot.checked(q).copy()
         # No matrix depends on where the base is, but sums about a far origin would round more.
         position = configuration[:3].copy()
         configuration[:3] = 0.0
