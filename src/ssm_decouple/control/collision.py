@@ -110,7 +110,7 @@ class Distances:
         for first, second in chosen:
             self._geometry.addCollisionPair(pin.CollisionPair(first, second))
         self.names: tuple[Pair, ...] = tuple((links[first], links[second]) for first, second in chosen)
-        self._data = robot.model.createData()
+        self._data = pin.Data(robot.model)
         self._results = self._geometry.createData()
         self._candidates = _Candidates.of(self._geometry)
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()

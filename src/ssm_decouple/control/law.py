@@ -510,7 +510,7 @@ class SelectiveLaw(Settled):
         places, continuous = [float(joint.idx_q) for joint in joints], [float(joint.nq == 2) for joint in joints]
         scale = 1.0 / np.sqrt(self.joint_weights)
         columns = np.vstack([self.rate_limits, steps, places, continuous, np.zeros(n), scale, layout.moves])
-        data = model.createData()
+        data = pin.Data(model)
         # Live views into the Pinocchio data, fetched once: each fetch would cost as much as a tenth of the step.
         views = (data.Ag, data.J, _placements(data, model.njoints))
         constants = (U_c, layout.table.copy(), columns, parameters)

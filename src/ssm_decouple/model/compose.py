@@ -109,8 +109,9 @@ def _tool(part: ET.Element, arm_name: str, wanted: str | None, known: str | None
 
 
 def _rename(part: ET.Element, prefix: str) -> None:
+    top = {id(element) for element in part}
     for element in part.iter():
-        named = element.tag in ("link", "joint", "material", "mimic") and (element in part or element.tag != "link")
+        named = element.tag in ("link", "joint", "material", "mimic") and (id(element) in top or element.tag != "link")
         key = {"parent": "link", "child": "link", "mimic": "joint"}.get(element.tag, "name" if named else None)
         if key is not None and element.get(key) is not None:
             element.set(key, prefix + element.get(key, ""))

@@ -29,7 +29,7 @@ def massless_root(model: pin.Model) -> list[Finding]:
 
 def massless_joints(model: pin.Model) -> list[Finding]:
     """Say which joints carry links without inertia about their axis, or without mass along it."""
-    data = model.createData()
+    data = pin.Data(model)
     pin.crba(model, data, pin.neutral(model), pin.Convention.LOCAL)
     found = []
     for joint in range(2, model.njoints):
@@ -58,7 +58,7 @@ def refuse_singular_mass_matrix(model: pin.Model, q: Floats, name: str, free: ND
     Raises:
         ModelError: it is, up to rounding; the message names the joint and its link, or the root link.
     """
-    data = model.createData()
+    data = pin.Data(model)
     upper = np.triu(pin.crba(model, data, q, pin.Convention.LOCAL))
     places = np.arange(model.nv) if free is None else np.asarray(free)
     M = (upper + np.triu(upper, 1).T)[np.ix_(places, places)]

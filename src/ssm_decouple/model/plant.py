@@ -160,7 +160,7 @@ class Plant:
             return np.empty(0)
         model = self.robot.model
         at = self.robot.configuration() if q is None else self.robot.checked(q)
-        upper = np.triu(pin.crba(model, model.createData(), at))
+        upper = np.triu(pin.crba(model, pin.Data(model), at))
         M = upper + np.triu(upper, 1).T
         places = 6 + self.hinges
         M_bb, M_bh = M[:6, :6], M[:6, places]

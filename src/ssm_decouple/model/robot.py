@@ -23,6 +23,7 @@ from ssm_decouple.errors import (
     shown,
 )
 from ssm_decouple.model.appendage import Appendage, Modes, checked_appendages, inspect_remaining_bus
+from ssm_decouple.model.folded import folded_model, has_many_fixed_links
 from ssm_decouple.model.locked import locked_urdf
 from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.payload import loaded_urdf, payload_body
@@ -99,12 +100,12 @@ class Robot(Settled):
         self.urdf = urdf
         self.name = name
         try:
-            self.model: pin.Model = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
+            self.model: pin.Model = _built(root, urdf)
         except (ValueError, RuntimeError) as error:
             raise ModelError(f"robot '{name}': Pinocchio cannot read it: {error}") from error
         self.model.gravity.setZero()  # Pinocchio's own default would be in whatever a user computes with the model
         self._refuse_lost_mass(root)
-        self._data: pin.Data = self.model.createData()
+        self._data = pin.Data(self.model)
         self._neutral: Floats = pin.neutral(self.model)
         self.n_joints: int = self.model.nv - 6
         self.joint_names: tuple[str, ...] = tuple(self.model.names[2:])
@@ -132,7 +133,7 @@ class Robot(Settled):
             InputError: two share a name.
         """
         robot = copy.copy(self)
-        robot._data = self.model.createData()  # the model is shared, what is computed on it is not
+        robot._data = pin.Data(self.model)  # the model is shared, what is computed on it is not
         robot.__dict__["appendages"] = robot._fitting(appendages)
         return robot
 
@@ -503,6 +504,13 @@ class Robot(Settled):
         from ssm_decouple.model.report import Report
 
         return Report.of_robot(self)
+
+
+def _built(root: ET.Element, urdf: str) -> pin.Model:
+    def build(text: str) -> pin.Model:
+        return pin.buildModelFromXML(text, pin.JointModelFreeFlyer())
+
+    return folded_model(root, build) if has_many_fixed_links(root) else build(urdf)
 
 
 def rigid_pose(name: str, pose: pin.SE3 | ArrayLike) -> pin.SE3:

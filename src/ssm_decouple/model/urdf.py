@@ -135,12 +135,13 @@ def _inspect_tree(root: ET.Element) -> list[Finding]:
             if count > 1
         ]
     parents: dict[str, str] = {}
+    known = set(links)
     for joint in root.findall("joint"):
         where = f"joint {joint.get('name')}"
         for role in ("parent", "child"):
             end = joint.find(role)
             link = None if end is None else end.get("link")
-            if link not in links:
+            if link not in known:
                 found.append(Finding("impossible", where, f"its {role} link '{link}' does not exist"))
         if found:
             continue
@@ -152,9 +153,13 @@ def _inspect_tree(root: ET.Element) -> list[Finding]:
         roots = [link for link in links if link not in parents]
         if len(roots) != 1:
             found.append(Finding("impossible", "robot", f"needs exactly one root link, has {roots or 'a loop'}"))
-        reached = set(roots)
-        while more := {child for child, parent in parents.items() if parent in reached} - reached:
-            reached |= more
+        below: dict[str, list[str]] = {}
+        for child, parent in parents.items():
+            below.setdefault(parent, []).append(child)
+        walked = list(roots)
+        for link in walked:  # grows while it is walked
+            walked += below.get(link, [])
+        reached = set(walked)
         if len(roots) == 1 and len(reached) < len(links):
             lost = ", ".join(link for link in links if link not in reached)
             found.append(Finding("impossible", "robot", f"links {lost} form a loop, away from the root '{roots[0]}'"))

@@ -62,7 +62,8 @@ class Coupling:
         Raises:
             InputError: q has the wrong length or is not finite.
         """
-        model, data, configuration = checked_robot(robot).model, robot.model.createData(), robot.checked(q).copy()
+        model = checked_robot(robot).model
+        data, configuration = pin.Data(model), robot.checked(q).copy()
         # No matrix depends on where the base is, but sums about a far origin would round more.
         position = configuration[:3].copy()
         configuration[:3] = 0.0

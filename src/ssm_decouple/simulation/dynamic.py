@@ -255,7 +255,7 @@ class DynamicMotion:
         self.q = self._positions(self.start)
         self.v: Floats = np.zeros(self.plant.robot.model.nv)
         model = self.plant.robot.model
-        A_g = pin.computeCentroidalMap(model, model.createData(), self.start)
+        A_g = pin.computeCentroidalMap(model, pin.Data(model), self.start)
         self.v[:6] = np.linalg.solve(A_g[:, :6], law.momentum)
         attitude = pin.Quaternion(q[3:7]).matrix()
         self._plant_moved: Floats = np.zeros(self.plant.robot.model.nv)
@@ -471,7 +471,7 @@ class DynamicMotion:
         The last are the largest sums of linear and angular momenta (2,) that base and joints carry one by one.
         """
         model = self.plant.robot.model
-        data, m = model.createData(), len(configurations)
+        data, m = pin.Data(model), len(configurations)
         frame = model.getFrameId(self.law.robot.end_effector)
         momenta, centres, points, energies = np.empty((m, 6)), np.empty((m, 3)), np.empty((m, 3)), np.empty(m)
         carried = np.full(2, TINY)

@@ -165,7 +165,7 @@ def rotations_to(robot: Robot | None, frame: str, configurations: Floats) -> Flo
     if frame == "inertial":
         return Rotation.from_quat(np.ascontiguousarray(configurations[:, 3:7])).as_matrix()
     assert robot is not None
-    held, data = robot.model.frames[robot.frame_id(frame)], robot.model.createData()
+    held, data = robot.model.frames[robot.frame_id(frame)], pin.Data(robot.model)
     turned = np.empty((len(configurations), 3, 3))
     for i, q in enumerate(configurations):
         pin.forwardKinematics(robot.model, data, q)
@@ -372,7 +372,7 @@ def robot_of(motion: xr.Dataset) -> Robot:
 
 def _audit(model: pin.Model, configurations: Floats, velocities: Floats) -> tuple[Floats, Floats]:
     momenta, centres = np.empty((len(configurations), 6)), np.empty((len(configurations), 3))
-    data = model.createData()
+    data = pin.Data(model)
     total, centre = data.hg, data.com[0]
     for i, (q, v) in enumerate(zip(configurations, velocities, strict=True)):
         near = from_base(q)
