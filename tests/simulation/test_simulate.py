@@ -172,6 +172,7 @@ def test_the_integral_of_the_twist_is_what_it_says(ets_vii, method):
     )
 
 
+@pytest.mark.filterwarnings("ignore:the commanded rates reverse")
 @pytest.mark.parametrize("method", ["explicit", "held", "rk4"])
 def test_modes_of_appendages_are_not_excited(ets_vii, method):
     protection = modes(ets_vii)

@@ -14,6 +14,7 @@ from ssm_decouple.batch.base import Engine, Floats, Judge, Progress, Wanted
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.errors import InputError, as_floats, as_kind, as_whole, shown
+from ssm_decouple.model.origin import FAR
 from ssm_decouple.model.robot import UNIT, Robot
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.steps import sample_times
@@ -268,6 +269,10 @@ class TracedLaw:
         times = sample_times(duration, dt)
         holds = jax.numpy.asarray(np.diff(times, append=times[-1]))
         law, (columns, place, point) = self._given(joints, target, pose, gain)
+        # Counted from where the base starts, if that is far from the inertial origin.
+        far = jax.numpy.max(jax.numpy.abs(place[:3]), axis=0) > FAR
+        origin = jax.lax.stop_gradient(jax.numpy.where(far, place[:3], 0.0))
+        place, point = place.at[:3].add(-origin), point - origin
 
         def step(state: Any, hold: Array) -> Any:
             columns, place = state
@@ -276,6 +281,8 @@ class TracedLaw:
             return after, (columns, place, told)
 
         _, (all_joints, poses, told) = jax.lax.scan(step, (columns, place), holds)
+        poses = poses.at[:, :3].add(origin)
+        told, all_joints, poses = jax.tree.map(lambda x: jax.numpy.moveaxis(x, 0, -1), (told, all_joints, poses))
         told, all_joints, poses = jax.tree.map(lambda x: jax.numpy.moveaxis(x, 0, -1), (told, all_joints, poses))
         return TracedMotion(_front(all_joints, 1), _front(poses, 1), _traced(told))
 
@@ -464,5 +471,6 @@ def _travelled(
         after = joints + hold * told.joint_rates, functions.moved(poses, told.base_twist, hold), record
         return after, jnp.sqrt(jnp.sum(told.end_effector_error**2, axis=0))
 
-    ends, history = jax.lax.scan(step, (joints, poses, functions.start_record(poses)), holds)
-    return (*ends, history)
+    start = joints, poses, functions.start_record(joints, poses)
+    (joints, poses, (record, _)), history = jax.lax.scan(step, start, holds)
+    return joints, poses, record, history

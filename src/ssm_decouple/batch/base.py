@@ -15,6 +15,7 @@ from ssm_decouple.batch.results import Commands, Matrices, Motions
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.control.schedule import ScheduledLaw
 from ssm_decouple.errors import InputError, as_floats, as_function, as_items, as_kind, as_positive, as_whole, shown
+from ssm_decouple.model.origin import FAR
 from ssm_decouple.model.robot import UNIT, Robot, checked_robot
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.settled import Settled
@@ -167,12 +168,13 @@ class Engine(Settled):
             InputError: another law, shapes that do not fit, or a base quaternion that is not of unit length.
         """
         joints, poses, wanted = self._starts(law, configurations, targets)
+        origins = _take_out_origins(poses, wanted)
         out = np.empty((len(joints), law.size))
         self._command(law, joints, poses, wanted, out)
         commands = Commands(out, self.robot.n_joints, law.protection.k)
         tools = commands.end_effector_position.copy()
         rows.place_points(poses, tools)
-        commands.end_effector_position[:], commands.end_effector_error[:] = tools, wanted - tools
+        commands.end_effector_position[:], commands.end_effector_error[:] = tools + origins, wanted - tools
         return commands
 
     def motions(
@@ -203,6 +205,7 @@ class Engine(Settled):
         times = sample_times(duration, dt)
         tolerance = as_positive("arrival_tolerance", arrival_tolerance)
         joints, poses, wanted = self._starts(law, starts, targets)
+        origins = _take_out_origins(poses, wanted)
         N = len(joints)
         record, errors = np.empty((N, rows.RECORD_SIZE)), np.empty(N)
         outcomes: NDArray[np.str_] = np.full(N, "undefined", dtype="<U9")
@@ -214,6 +217,7 @@ class Engine(Settled):
 
         self._move(law, joints, poses, wanted, times, record, judge, progress)
         record[np.isnan(errors)] = np.nan
+        poses[:, :3] += origins
         return Motions(
             outcome=outcomes,
             outcome_time=outcome_times,
@@ -223,6 +227,7 @@ class Engine(Settled):
             protected_rate=record[:, rows.LEAK],
             base_rotation=record[:, rows.HIGHEST : rows.HIGHEST + 3] - record[:, rows.LOWEST : rows.LOWEST + 3],
             smallest_singular_value=record[:, rows.SMALLEST],
+            rate_reversals=record[:, rows.REVERSALS],
             configuration=self._configurations(joints, poses),
         )
 
@@ -327,6 +332,18 @@ class Engine(Settled):
                 raise InputError(
                     f"the law has {what}, which the batch engine does not do; use the law itself or simulate(..)"
                 )
+
+
+def _take_out_origins(poses: Floats, targets: Floats) -> Floats:
+    """Count the positions of poses (N, 7) that are far from the inertial origin, and their targets (N, 3), from there.
+
+    In place; what is to be added to come back is returned (N, 3). A position near the origin stays as it is.
+    """
+    far = np.abs(poses[:, :3]).max(axis=1) > FAR
+    origins = np.where(far[:, None] & np.isfinite(poses[:, :3]), poses[:, :3], 0.0)
+    poses[:, :3] -= origins
+    targets -= origins
+    return origins
 
 
 def _checked(protections: Sequence[Protection | str]) -> list[Protection]:

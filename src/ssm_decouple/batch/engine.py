@@ -108,12 +108,14 @@ class Batch(Engine):
             kept[:] = 0.0
             kept[:, rows.SMALLEST : rows.HIGHEST] = np.inf
             kept[:, rows.HIGHEST : rows.LATEST] = -np.inf
+            trail = np.zeros((count, rows.TRAIL_SIZE, self.robot.n_joints))
+            trail[:, rows.BEFORE] = np.nan
             for i, hold in enumerate(holds):
                 if stop.is_set():
                     break
                 rows.see_targets(at, wanted, seen)
                 self._solve(constants, own, seen, values, out)
-                rows.advance(out, protected, k, errors + 3, errors, hold, own, at, kept, history[i])
+                rows.advance(out, protected, k, errors + 3, errors, hold, own, at, kept, trail, history[i])
             judge(part, history.T)
 
         share = -(-len(joints) // self.threads)

@@ -123,6 +123,8 @@ class Motions:
         base_rotation: Base roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), peak to peak (N, 3), rad; each is
             counted on beyond half a turn.
         smallest_singular_value: Of J_gt N_sub, the smallest on the way (N,), m.
+        rate_reversals: How often the rate of a joint reverses from sample to sample, of the joint that does it most
+            (N,): hundreds where the command chatters at a singularity.
         configuration: Pinocchio configuration at the end (N, nq).
     """
 
@@ -134,4 +136,5 @@ class Motions:
     protected_rate: Floats
     base_rotation: Floats
     smallest_singular_value: Floats
+    rate_reversals: Floats
     configuration: Floats

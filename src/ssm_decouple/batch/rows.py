@@ -24,7 +24,18 @@ SMALLEST = 3  # smallest singular value
 LOWEST = 4  # 3: roll, pitch and yaw at their lowest
 HIGHEST = 7  # 3: at their highest
 LATEST = 10  # 3: as they are now, counted on beyond half a turn
-RECORD_SIZE = 13
+REVERSALS = 13  # of the joint rate that reverses most often from sample to sample
+RECORD_SIZE = 14
+
+# What has to be known of the samples before to see that, one entry a joint.
+BEFORE = 0  # the rate at the sample before; not a number at the first
+CHANGE = 1  # its change, if that was large, else zero
+OWN_PEAK = 2  # largest rate of the joint so far
+COUNT = 3  # reversals so far
+TRAIL_SIZE = 4
+
+REVERSAL_SHARE = 0.05  # as in simulation/telling.py
+NOTHING = 1e-6  # likewise
 
 
 @compiled
@@ -89,6 +100,19 @@ def keep_attitude(pose: Floats, record: Floats) -> None:
         record[HIGHEST + i] = max(record[HIGHEST + i], angle)
 
 
+@compiled
+def keep_reversals(rates: Floats, trail: Floats, record: Floats) -> None:
+    """Count the joint rates (n,) that reverse: whose change is large and against a large one at the sample before."""
+    for j in range(rates.shape[0]):
+        change = rates[j] - trail[BEFORE, j]
+        trail[OWN_PEAK, j] = max(trail[OWN_PEAK, j], abs(rates[j]))
+        large = abs(change) > max(REVERSAL_SHARE * trail[OWN_PEAK, j], NOTHING * record[PEAK])
+        trail[COUNT, j] += 1.0 if large and change * trail[CHANGE, j] < 0.0 else 0.0
+        trail[CHANGE, j] = change if large else 0.0
+        trail[BEFORE, j] = rates[j]
+        record[REVERSALS] = max(record[REVERSALS], trail[COUNT, j])
+
+
 @unlocked
 def see_targets(poses: Floats, targets: Floats, seen: Floats) -> None:
     """Fill the targets (rows, 3), inertial axes, as seen from the base poses (rows, 7)."""
@@ -125,6 +149,7 @@ def advance(
     joints: Floats,
     poses: Floats,
     record: Floats,
+    trail: Floats,
     history: Floats,
 ) -> None:
     """Keep what a sample tells of each motion, then hold its rates and its base twist for a time.
@@ -139,6 +164,7 @@ def advance(
         joints: Joint positions (rows, n), moved.
         poses: Base poses (rows, 7), moved.
         record: (rows, RECORD_SIZE), brought up to date.
+        trail: (rows, TRAIL_SIZE, n), likewise.
         history: The distance to the target at this sample (rows,), overwritten.
     """
     n = joints.shape[1]
@@ -157,6 +183,7 @@ def advance(
             kept[LEAK] = max(kept[LEAK], abs(command[protected + i]))
         kept[TRAVEL] += time * np.sqrt(square)
         kept[SMALLEST] = min(kept[SMALLEST], command[smallest])
+        keep_reversals(command[6 : 6 + n], trail[row], kept)
         keep_attitude(poses[row], kept)
         if time > 0.0:
             move_pose(poses[row], command, time)

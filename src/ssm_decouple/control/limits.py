@@ -28,9 +28,11 @@ KINDS = {
 TOLERANCES = {"primal_tol": 1e-12, "dual_tol": 1e-12, "iter_limit": 500}
 LEAST = 1e-11  # weight of the rates beside that of what exceeds the acceleration limits
 KEPT = 1e-7  # share of the acceleration limits that is left for rounding there
-# Weight of the change of the rates, as kernel.STEADY, while joints or pairs of bodies are brought back inside their
-# limits: beside bounds that leave them hardly any way, the others would be thrown from limit to limit.
-RETURN_STEADY = 0.5
+# Weights of the change of the rates, as kernel.STEADY, while joints or pairs of bodies are brought back inside their
+# limits: of those that return, and of what the tasks do meanwhile. Beside bounds that leave them hardly any way, the
+# others would be thrown from limit to limit.
+RETURN_STEADY = 0.2
+TASK_STEADY = 0.5
 
 
 @dataclass(frozen=True)
@@ -398,7 +400,7 @@ class LimitedStep:
             direction = table[kernel.FIXED : kernel.FIXED + 1] / length
             # More than is wanted is asked for, and a bound keeps it to that: so no regularisation takes from it.
             self._step(buffers, direction, np.array([1.01 * length]), 0.0, 0.0, first - 1, 1, asked, rates)
-        steady = RETURN_STEADY if told[kernel.RETURNING] else kernel.STEADY
+        steady = TASK_STEADY if told[kernel.RETURNING] else kernel.STEADY
         for number, (J, v, rho) in enumerate(levels):
             if first == n:
                 break

@@ -21,6 +21,7 @@ Floats = NDArray[np.float64]
 # A rate reverses where its change from sample to sample does, both changes being above this share of the joint's
 # largest rate so far: no smooth motion has that twice running.
 REVERSAL_SHARE = 0.05
+NOTHING = 1e-6  # of the largest rate of any joint so far: less is rounding
 REVERSALS = 10  # of a joint, from which on they are told
 SETTLED = (
     1e-9  # relative change in the last pass of planning above which the mean over the hold is not what was planned
@@ -35,8 +36,8 @@ def reversals(joint_rates: Floats) -> NDArray[np.bool_]:
         joint_rates: Commanded rates (m, n), rad/s or m/s.
     """
     found = np.zeros(joint_rates.shape, dtype=bool)
-    changes = np.diff(joint_rates, axis=0)
-    large = np.abs(changes) > REVERSAL_SHARE * np.maximum.accumulate(np.abs(joint_rates))[1:]
+    changes, peaks = np.diff(joint_rates, axis=0), np.maximum.accumulate(np.abs(joint_rates))[1:]
+    large = np.abs(changes) > np.maximum(REVERSAL_SHARE * peaks, NOTHING * peaks.max(axis=1, keepdims=True))
     found[1:-1] = large[1:] & large[:-1] & (changes[1:] * changes[:-1] < 0.0)
     return found
 

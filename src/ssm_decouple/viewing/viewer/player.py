@@ -108,7 +108,9 @@ class Player(Page):
         assert self.bending is not None
         power = self.bending.value
         if not self.bending.min <= power <= self.bending.max:
-            raise InputError(f"bending is 10^{power:g}; the slider goes from {self.bending.min:g} to {self.bending.max:g}")
+            raise InputError(
+                f"bending is 10^{power:g}; the slider goes from {self.bending.min:g} to {self.bending.max:g}"
+            )
         self.exaggeration = float(f"{10.0**power:.2g}")
         self.bending.label = f"bending x {self.exaggeration:g}"
         self._wake.set()
