@@ -15,7 +15,7 @@ from ssm_decouple.control import kernel
 from ssm_decouple.control.task import Layout, PositionTask, Task, checked_tasks
 from ssm_decouple.errors import DecoupleWarning, InputError, as_floats, as_not_negative, as_number, as_positive
 from ssm_decouple.model.robot import Robot, per_joint
-from ssm_decouple.momentum.flow import munthe_kaas
+from ssm_decouple.momentum.flow import munthe_kaas, places_on_hold, quadrature_along, ways_to_nodes
 from ssm_decouple.momentum.protection import Protection
 
 if TYPE_CHECKING:
@@ -375,6 +375,11 @@ class SelectiveLaw:
             )
         self._prepared[3][3][kernel.MOMENTUM :] = values
 
+    @property
+    def _turning(self) -> bool:
+        """Whether the plan for a hold needs the base's attitude on the way, and can have it without momentum."""
+        return self.protection.frame == "inertial" and not self._prepared[3][3][kernel.MOMENTUM :].any()
+
     def _refuse_what_nothing_is_left_for(self) -> None:
         """Count freedoms where the arm stands nowhere special."""
         n = self.robot.n_joints
@@ -464,6 +469,7 @@ class SelectiveLaw:
         self._any_target: Floats = layout.any_target()
         self._J_base: Floats = np.zeros((6, n))
         self._J_here: Floats = np.zeros((6, n))
+        self._J_nodes: Floats = np.zeros((self.hold_nodes, 6, n))
         self._matrices: Floats = np.zeros((kernel.J_TASK + layout.size, n))
         self._drift: Floats = np.zeros((kernel.J_TASK + layout.size, 1))
         self._later: Floats = np.zeros(layout.target_sizes[0])
@@ -710,6 +716,40 @@ class SelectiveLaw:
         momentum = parameters[kernel.MOMENTUM :]
         return twist + np.linalg.solve(A_g[:, :6], momentum) if momentum.any() else twist
 
+    def rotation_to_axes(self, q: Floats) -> Floats | None:
+        """Return the rotation (3, 3) at q from base axes to those in which `directions` are fixed.
+
+        None where those are base axes.
+        """
+        frame = self.directions[1]
+        if frame == "base":
+            return None
+        model, data, *_ = self._prepared
+        pin.forwardKinematics(model, data, q)
+        R: Floats = data.oMi[1].rotation
+        if frame == "inertial":
+            return R.copy()
+        held = model.frames[self.robot.frame_id(frame)]
+        return (data.oMi[held.parentJoint].rotation @ held.placement.rotation).T @ R
+
+    def mean_twist(self, q: Floats, joint_rates: Floats) -> Floats:
+        """Return the mean base twist (6,) over the hold of joint rates (n,) from q, in the axes of `directions`.
+
+        It is taken on the law's own Gauss points, as the law plans; without hold nodes it is the twist at q.
+        """
+        model, hold, nodes = self.robot.model, float(self.sample_time or 0.0), GAUSS[self.hold_nodes]
+        drifting, velocity = bool(self.momentum.any()), np.r_[np.zeros(6), joint_rates]
+        if not nodes:
+            places = q[None]
+        elif drifting:
+            places = np.array([self._after(q, velocity, i) for i in range(len(nodes))])
+        else:
+            places = np.array([pin.integrate(model, q, node * hold * velocity) for node, _ in nodes])
+        twists = np.array([self.base_twist(place, joint_rates) for place in places])
+        if nodes and not drifting:
+            places = places_on_hold(model, q, joint_rates, hold, twists)
+        return quadrature_along(self.rotation_to_axes, places, twists, 1.0)
+
     def lost_direction(self, q: ArrayLike) -> LostDirection:
         """Return the direction that the tasks of level 1 can move in least at q, and which protected row takes it.
 
@@ -769,18 +809,22 @@ class SelectiveLaw:
 
         Where `previous` are rates to be projected, `commanded` are those that were commanded before.
         """
-        model, data, _, (U_c, tasks, columns, _), fixed = self._prepared
+        model, data, views, (U_c, tasks, columns, _), fixed = self._prepared
         hold, matrices, drift, rates = float(self.sample_time or 0.0), self._matrices, self._drift, self._rates
         targets = self._later
         velocity, results = out[: model.nv], out[model.nv :]
         position, errors = results[kernel.POSITION :][:3], results[kernel.ERRORS :][: self.layout.size]
         status, change, before = kernel.OK, np.inf, velocity[6:].copy()
+        nodes = GAUSS[self.hold_nodes]
+        self._ways = hold * np.outer([node for node, _ in nodes], velocity[:6])
         for _ in range(PASSES):
             for total in (matrices, drift, rates, position, errors):
                 total[:] = 0.0
-            for node, weight in GAUSS[self.hold_nodes]:
-                moved = self._after(q, velocity, node * hold)
+            for i, (_, weight) in enumerate(nodes):
+                moved = self._after(q, velocity, i)
                 pin.computeCentroidalMap(model, data, moved)
+                if self._turning:
+                    kernel.base_twist_map(views[0], self._J_nodes[i])
                 if self._reads_joints:
                     kernel.read_joints(moved, columns)
                 status = status or kernel.add_matrices(*fixed, targets, velocities, weight, matrices, drift, rates, out)
@@ -796,19 +840,26 @@ class SelectiveLaw:
                 else:
                     self._bring_inside(q, commanded, out, goal=previous)
             velocity[:6] = self._J_here @ velocity[6:] + self._base_drift
+            if self._turning:
+                self._ways = ways_to_nodes(self._J_nodes @ velocity[6:], hold)
             change = kernel.change_of(velocity[6:], before)
             if status != kernel.OK or change <= CONVERGED:
                 break
         return status, change
 
-    def _after(self, q: ArrayLike, velocity: Floats, time: float) -> Floats:
-        """Return where joint rates that are held lead.
+    def _after(self, q: ArrayLike, velocity: Floats, node: int) -> Floats:
+        """Return where joint rates that are held lead until a Gauss node of the hold.
 
-        Without momentum no matrix depends on where the base is, so that its first twist will do.
+        Directions fixed in inertial axes need the attitude there: it comes from the twists at all nodes in the pass
+        before, so that it settles with the rates. Of directions fixed in base axes or those of a link no matrix depends
+        on where the base is, so that its first twist will do. With momentum on board the base is led there step by
+        step.
         """
+        time, rates = GAUSS[self.hold_nodes][node][0] * float(self.sample_time or 0.0), velocity[6:]
+        if self._turning:
+            return pin.integrate(self.robot.model, q, np.r_[self._ways[node], time * rates])
         if not self._prepared[3][3][kernel.MOMENTUM :].any():
             return pin.integrate(self.robot.model, q, time * velocity)
-        rates = velocity[6:]
         start = np.asarray(q)
 
         def drifting(at: Floats, _: float) -> Floats:

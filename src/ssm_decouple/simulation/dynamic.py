@@ -19,6 +19,7 @@ from ssm_decouple.model.robot import UNLIMITED, Robot
 from ssm_decouple.model.tree import Tree
 from ssm_decouple.simulation import physics
 from ssm_decouple.simulation.motion import build_motion, flagged_spans, rotations_to, twist_along
+from ssm_decouple.simulation.steps import Moved, after_jump, between
 
 Floats = NDArray[np.float64]
 
@@ -271,20 +272,26 @@ class DynamicMotion:
     def _law_configuration(self, positions: Floats) -> Floats:
         return self._with_base(self.law.robot.model, self._law_moved, positions)
 
+    def _law_velocity(self) -> Floats:
+        """Return the velocity of the law's robot (nv,): base twist in base axes, then joint rates."""
+        return np.r_[self.v[:6], self.v[6 + self.driven]]
+
     def correction(self) -> Floats | None:
         """Return the rate b (k,) about the protected directions that takes back what the gyros have told."""
         return -self.settings.feedback_gain * self.measured if self.settings.feedback_gain else None
 
-    def move(self, rates: Floats, t: float, t_next: float) -> tuple[Floats, Floats]:
+    def move(self, rates: Floats, t: float, t_next: float) -> Moved:
         """Hold commanded joint rates (n,) from t to t_next.
 
         Returns:
-            The configuration of the law's robot (nq,) then, and the integral of the base twist (6,), base axes.
+            The configuration of the law's robot (nq,) then, and the integral of the base twist (6,), in base axes and
+            in those of the law's directions.
 
         Raises:
             FloatingPointError: the motion has diverged; the message says when.
         """
         held, before = _holding(self.settings, t, t_next), self.totals[:6].copy()
+        start, first = self._law_configuration(self.q[self.driven]), self._law_velocity()
         held[physics.INERTIAL] = float(self.axes == "inertial")
         bad = physics.advance(
             *self._constants,
@@ -302,7 +309,11 @@ class DynamicMotion:
             raise FloatingPointError(f"{t + bad * held[physics.STEP]:.6g}")
         twist = self.totals[:6] - before
         self._measure(twist, t_next - t)
-        return self._law_configuration(self.q[self.driven]), twist
+        end, dt = self._law_configuration(self.q[self.driven]), t_next - t
+        velocities = np.array([first, self._law_velocity()])
+        if self.settings.servo is None:
+            velocities = after_jump(velocities, rates, twist, dt)
+        return end, twist, between(self.law, np.array([start, end]), velocities, twist, dt)
 
     def sample(self) -> None:
         """Remember the state for the record."""

@@ -152,41 +152,6 @@ def rotations_to(robot: Robot | None, frame: str, configurations: Floats) -> Flo
     return turned
 
 
-def protected_integral(
-    U_twist: Floats, frame: str, twists: Floats, configurations: Floats, robot: Robot | None = None
-) -> Floats:
-    """Return how far the base has moved along directions of its twist since the start (m, k), m and rad.
-
-    Along directions fixed in base axes this is the integral of the twist's components. Along directions fixed in
-    inertial axes the linear part is the displacement of the base origin, and for the angular part the rotations from
-    sample to sample are summed, which is its integral to second order in the time between samples. So is the integral
-    along directions fixed in another frame.
-
-    Args:
-        U_twist: Directions of the base twist, columns (6, k).
-        frame: "base", "inertial" or a frame of the robot.
-        twists: Integral of the base twist, base axes (m, 6), m and rad.
-        configurations: Configurations (m, nq), of which the base poses are read.
-        robot: The robot, needed where the frame is one of its own.
-    """
-    from scipy.spatial.transform import Rotation
-
-    if frame == "base" or len(twists) == 1:
-        return twists @ U_twist
-    if frame == "inertial":
-        attitude = Rotation.from_quat(np.ascontiguousarray(configurations[:, 3:7]))
-        turns = np.zeros((len(twists), 3))
-        turns[1:] = np.cumsum((attitude[1:] * attitude[:-1].inv()).as_rotvec(), axis=0)
-        return np.hstack([configurations[:, :3] - configurations[0, :3], turns]) @ U_twist
-    turned = rotations_to(robot, frame, configurations)
-    assert turned is not None
-    between = 0.5 * (turned[1:] + turned[:-1])
-    steps = np.diff(twists, axis=0).reshape(-1, 2, 3)
-    moved = np.zeros_like(twists)
-    moved[1:] = np.cumsum(np.einsum("mij,mbj->mbi", between, steps).reshape(-1, 6), axis=0)
-    return moved @ U_twist
-
-
 def twist_along(
     U_twist: Floats, frame: str, twists: Floats, configurations: Floats, robot: Robot | None = None
 ) -> Floats:
@@ -205,6 +170,31 @@ def twist_along(
     return twists @ U_twist
 
 
+def sum_along(U_twist: Floats, frame: str, twists: Floats, configurations: Floats) -> Floats:
+    """Return how far the base has moved along directions of its twist since the start (m, k), m and rad.
+
+    Args:
+        U_twist: Directions of the base twist, columns (6, k).
+        frame: "base", "inertial" or a frame of the robot: the axes in which they are fixed.
+        twists: Integral of the base twist in these axes (m, 6), m and rad.
+        configurations: Configurations (m, nq). In inertial axes the base positions in them are that integral.
+    """
+    if frame == "inertial":
+        twists = np.hstack([configurations[:, :3] - configurations[0, :3], twists[:, 3:]])
+    return twists @ U_twist
+
+
+def _protected_rates(law: SelectiveLaw, configurations: Floats, values: Floats, scheduled: bool) -> Floats:
+    """Return the base twist along the law's directions (m, k), as the law plans: at the sample or over the hold."""
+    n, (U_twist, axes) = law.robot.n_joints, law.directions
+    if not scheduled:
+        return values[:, 6 + n + kernel.PROTECTED_RATE :][:, : U_twist.shape[1]]
+    if law.hold_nodes:  # a command tells them of the rows alone that are protected then
+        means = [law.mean_twist(q, v[6:]) for q, v in zip(configurations, values[:, : 6 + n], strict=True)]
+        return np.array(means).reshape(-1, 6) @ U_twist
+    return twist_along(U_twist, axes, values[:, :6], configurations, law.robot)
+
+
 def build_motion(
     law: SelectiveLaw,
     time: Floats,
@@ -221,7 +211,7 @@ def build_motion(
         time: Sample times (m,), s.
         configurations: Configurations (m, nq).
         values: The law's output arrays (m, law.size).
-        twists: Integral of the base twist, base axes (m, 6), m and rad.
+        twists: Integral of the base twist in base axes and in those of the law's directions (2, m, 6), m and rad.
         targets: Flat targets (m, size): of one position, that position (m, 3), m, inertial axes.
         audited: Momenta (m, 6) and centres of mass (m, 3) for the audit; None is those of what the law commands.
 
@@ -249,11 +239,9 @@ def build_motion(
         "base_rpy": attitude.as_euler("ZYX")[:, ::-1],
         "base_linear_velocity": values[:, :3],
         "base_angular_velocity": values[:, 3:6],
-        "protected_rate": results[:, kernel.PROTECTED_RATE : kernel.PROTECTED_RATE + k]
-        if shares is None
-        else twist_along(U_twist, axes, values[:, :6], configurations, robot),
-        "base_twist_integral": twists,
-        "protected_angle": protected_integral(U_twist, axes, twists, configurations, robot),
+        "protected_rate": _protected_rates(law, configurations, values, shares is not None),
+        "base_twist_integral": twists[0],
+        "protected_angle": sum_along(U_twist, axes, twists[1], configurations),
         "end_effector_position": results[:, kernel.POSITION : kernel.POSITION + 3],
         "target_position": nowhere if layout.tool_target is None else targets[:, layout.tool_target],
         "end_effector_error": np.linalg.norm(

@@ -26,7 +26,7 @@ from ssm_decouple.errors import (
 )
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import build_motion, error_of, judge
-from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted, sample_times
+from ssm_decouple.simulation.steps import STEPS, Demand, Moved, Pace, Reference, Wanted, sample_times
 
 Floats = NDArray[np.float64]
 Method = Literal["explicit", "held", "rk4"]
@@ -162,7 +162,7 @@ class _Run:
         samples, n = time.size, law.robot.n_joints
         self.configurations = np.empty((samples, start.size))
         self.configurations[0] = start
-        self.twists = np.zeros((samples, 6))
+        self.twists = np.zeros((2, samples, 6))  # integrals, in base axes and in those of the law's directions
         self.targets = np.empty((samples, law.layout.target_sizes[0]))
         self.values = np.empty((samples, law.size))
         self.rates = self.values[:, 6 : 6 + n]
@@ -175,8 +175,8 @@ class _Run:
         """Move to the next sample and ask the law there."""
         i, time = self.done, self.time
         if i > 0:
-            self.configurations[i], moved = self._move(i)
-            self.twists[i] = self.twists[i - 1] + moved
+            self.configurations[i], *moved = self._move(i)
+            self.twists[:, i] = self.twists[:, i - 1] + moved
         self.targets[i], velocity = self.demand.reference(time[i])
         middle = time[i] + self.leads[i]
         previous, pace = self.rates[i - 1] if i else self.at_rest, self.demand.pace(middle)
@@ -188,7 +188,7 @@ class _Run:
         self.law.evaluate(seen, self.targets[i], velocity, self.values[i], previous, wanted, pace, time[i])
         self.done = i + 1
 
-    def _move(self, i: int) -> tuple[Floats, Floats]:
+    def _move(self, i: int) -> Moved:
         span = (self.time[i - 1], self.time[i])
         if self.dynamic is not None:
             return self.dynamic.move(self.rates[i - 1], *span)
@@ -204,7 +204,7 @@ class _Run:
         """Return the motion so far."""
         law, done, time = self.law, self.done, self.time[: self.done]
         record = partial(build_motion, law) if self.dynamic is None else self.dynamic.record
-        motion = record(time, self.configurations[:done], self.values[:done], self.twists[:done], self.targets[:done])
+        motion = record(time, self.configurations[:done], self.values[:done], self.twists[:, :done], self.targets[:done])
         outcome = judge(time, error_of(motion), self.settings["arrival_tolerance"], 1.0 / law.layout.slowest_gain)
         motion.attrs |= {
             "method": "dynamic" if self.dynamic is not None else self.method,

@@ -1,6 +1,7 @@
 """From one sample to the next: how joints and base move under a command.
 
-Each step returns the next configuration and the integral of the base twist (6,) over the step, base axes.
+Each step returns the next configuration and the integral of the base twist (6,) over the step twice: in base axes, and
+in the axes in which the law's directions are fixed, as these turn along the motion that the step makes.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from ssm_decouple.control.law import GAUSS, SelectiveLaw
 from ssm_decouple.errors import InputError, as_positive
-from ssm_decouple.momentum.flow import munthe_kaas
+from ssm_decouple.momentum.flow import gauss_points, magnus, munthe_kaas, places_on_hold, quadrature_along, ways_to_nodes
 
 Floats = NDArray[np.float64]
 Reference = Callable[[float], tuple[Floats, Floats]]  # time to target position and velocity
@@ -33,53 +34,61 @@ class Demand(NamedTuple):
     protected_rate: Wanted
 
 
-Step = Callable[[SelectiveLaw, Demand, Floats, Floats, float, float], tuple[Floats, Floats]]
+Moved = tuple[Floats, Floats, Floats]  # configuration (nq,), the twist's integral (6,) in base axes and in the law's
+Step = Callable[[SelectiveLaw, Demand, Floats, Floats, float, float], Moved]
 
-_SQRT_15 = 15.0**0.5
-_JUDGE = [(0.5 + 0.5 * node, 0.5 * weight) for node, weight in zip(*np.polynomial.legendre.leggauss(5), strict=True)]
-
-
-def explicit(
-    law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float
-) -> tuple[Floats, Floats]:
-    """Hold joint rates and base twist: one Euler step on SE(3), how we read the paper."""
-    model, h = law.robot.model, t_next - t
-    return pin.integrate(model, q, h * values[: model.nv]), h * values[:6]
+JUDGING = 5  # Gauss points for integrals over a step, more than any law plans with, so that they judge it
 
 
-def held(
-    law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float
-) -> tuple[Floats, Floats]:
-    """Hold the joint rates; the base follows by a sixth-order Magnus expansion on three Gauss points.
+def hold_twist(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> Moved:
+    """Hold joint rates and base twist, together v (6 + n,): one Euler step on SE(3), how we read the paper."""
+    model = law.robot.model
+    moved = along = h * v[:6]
+    if law.directions[1] != "base":
+        nodes, _ = gauss_points(JUDGING)
+        places = np.array([pin.integrate(model, q, node * h * v) for node in nodes.tolist()])
+        along = quadrature_along(law.rotation_to_axes, places, np.tile(v[:6], (JUDGING, 1)), h)
+    return pin.integrate(model, q, h * v), moved, along
 
-    In base axes its twist depends on the joints alone, so the base pose at those points is not needed. The
-    coefficients are those of Blanes, Casas and Ros; the brackets change sign because the twist stands on the right.
-    The integral of the twist is taken on five points, more than any law plans with, so that it judges them.
+
+def hold_rates(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> Moved:
+    """Hold the joint rates of v (6 + n,); the base follows by a sixth-order Magnus expansion on three Gauss points.
+
+    In base axes its twist depends on the joints alone, so the base pose at those points is not needed. The integrals of
+    the twist are taken on JUDGING points; in other axes the base is led to each of them by collocation.
 
     With momentum on board the twist does depend on the attitude, and the fourth-order method takes its place.
     """
-    model, h = law.robot.model, t_next - t
-    rates = values[6 : model.nv]
+    model, rates = law.robot.model, v[6:]
     if law.momentum.any():
-        return munthe_kaas(model, q, values[: model.nv], h, lambda x, _: np.r_[law.base_twist(x, rates), rates])
+        return munthe_kaas(
+            model, q, v, h, lambda x, _: np.r_[law.base_twist(x, rates), rates], law.rotation_to_axes
+        )
     turning = np.r_[np.zeros(6), rates]
 
     def twist(node: float) -> Floats:
         return law.base_twist(pin.integrate(model, q, node * h * turning), rates)
 
-    first, middle, last = (pin.Motion(twist(node)) for node, _ in GAUSS[3])
-    one, two = middle * h, (last - first) * (_SQRT_15 / 3 * h)
-    three = (last - middle * 2.0 + first) * (10 / 3 * h)
-    fourth = two.cross(one)
-    fifth = one.cross(three * 2.0 + fourth) * (1 / 60)
-    base = one + three * (1 / 12) + (two + fifth).cross(fourth - one * 20.0 - three) * (1 / 240)
-    moved = h * np.sum([weight * twist(node) for node, weight in _JUDGE], axis=0)
-    return pin.integrate(model, q, np.r_[base.vector, h * rates]), moved
+    first, middle, last = (twist(node) for node, _ in GAUSS[3])
+    nodes, weights = gauss_points(JUDGING)
+    twists = np.array([twist(node) for node in nodes.tolist()])
+    moved = along = h * np.sum(weights[:, None] * twists, axis=0)
+    if law.directions[1] != "base":
+        along = quadrature_along(law.rotation_to_axes, places_on_hold(model, q, rates, h, twists), twists, h)
+    return pin.integrate(model, q, np.r_[magnus(first, middle, last, h), h * rates]), moved, along
 
 
-def runge_kutta(
-    law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float
-) -> tuple[Floats, Floats]:
+def explicit(law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float) -> Moved:
+    """Hold the command as it is."""
+    return hold_twist(law, q, values[: law.robot.model.nv], t_next - t)
+
+
+def held(law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float) -> Moved:
+    """Hold the joint rates of the command."""
+    return hold_rates(law, q, values[: law.robot.model.nv], t_next - t)
+
+
+def runge_kutta(law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float) -> Moved:
     """Call the law within the step too, by the classical fourth-order method."""
     model, buffer, at_rest = law.robot.model, np.empty(law.size), np.zeros(law.robot.n_joints)
 
@@ -89,7 +98,48 @@ def runge_kutta(
         law.evaluate(stage, *demand.reference(now), buffer, at_rest, wanted, demand.pace(now), now)
         return buffer[: model.nv].copy()
 
-    return munthe_kaas(model, q, values[: model.nv], t_next - t, velocity)
+    return munthe_kaas(model, q, values[: model.nv], t_next - t, velocity, law.rotation_to_axes)
+
+
+def after_jump(velocities: Floats, rates: Floats, moved: Floats, h: float) -> Floats:
+    """Return velocities at start and end of a step (2, nv), that at its start after joint rates have jumped there.
+
+    The base twist that follows from the jump is the one whose straight line to the end has the integral.
+
+    Args:
+        velocities: As recorded (2, nv): that at the start before the jump.
+        rates: Joint rates (n,) after it.
+        moved: Integral of the base twist (6,), base axes.
+        h: Length of the step, s.
+    """
+    return np.array([np.r_[2.0 * moved / h - velocities[1, :6], rates], velocities[1]])
+
+
+def between(law: SelectiveLaw, ends: Floats, velocities: Floats, moved: Floats, h: float) -> Floats:
+    """Return the integral of the base twist (6,) in the law's axes over a step of which only the ends are known.
+
+    The twist is the parabola that has its ends and its integral, and the joints take the cubic way that has theirs: of
+    fourth order in the step.
+
+    Args:
+        law: Its directions name the axes.
+        ends: Configurations at start and end (2, nq).
+        velocities: Pinocchio velocities there (2, nv).
+        moved: Integral of the base twist (6,), base axes.
+        h: Length of the step, s.
+    """
+    if law.directions[1] == "base":
+        return moved
+    nodes, _ = gauss_points(JUDGING)
+    x = nodes[:, None]
+    first, last = velocities
+    bulge = 6.0 * (moved / h - 0.5 * (first[:6] + last[:6]))
+    twists = first[:6] + x * (last[:6] - first[:6]) + x * (1.0 - x) * bulge
+    joints = pin.difference(law.robot.model, *ends)[6:]
+    turns = x**2 * (3.0 - 2.0 * x) * joints + h * x * (1.0 - x) * ((1.0 - x) * first[6:] - x * last[6:])
+    ways = zip(ways_to_nodes(twists, h), turns, strict=True)
+    places = np.array([pin.integrate(law.robot.model, ends[0], np.r_[way, turn]) for way, turn in ways])
+    return quadrature_along(law.rotation_to_axes, places, twists, h)
 
 
 STEPS: dict[str, Step] = {"explicit": explicit, "held": held, "rk4": runge_kutta}
