@@ -10,7 +10,8 @@ from random_robots import random_robot, random_state
 
 import ssm_decouple as ssm
 from ssm_decouple import Protection, SelectiveLaw
-from ssm_decouple.simulation.motion import judge, protected_integral
+from ssm_decouple.simulation.motion import judge
+from ssm_decouple.simulation.replay import integral_along
 
 START = np.deg2rad([150, -20, -10, 0, 0, 0])
 TARGET = [-1.8, -0.3, 1.2]
@@ -201,7 +202,7 @@ def test_twists_fixed_in_inertial_axes(ets_vii, rng):
     # A mixed direction under another law: the integral of its rate.
     mixed = np.linalg.qr(rng.normal(size=(6, 2)))[0]
     free = ssm.simulate(SelectiveLaw(ets_vii, Protection("none")), q, target, 20.0, 0.05, method="rk4")
-    along = protected_integral(mixed, "inertial", free.base_twist_integral.values, free.configuration.values)
+    along = integral_along(free, mixed, "inertial")
     R = np.array([ets_vii.base_pose(q).rotation for q in free.configuration.values])
     twist = np.hstack(
         [np.einsum("tij,tj->ti", R, free[name].values) for name in ("base_linear_velocity", "base_angular_velocity")]

@@ -38,18 +38,16 @@ def _on_the_way(count: int) -> Floats:
     return shares
 
 
-def magnus(first: Floats, middle: Floats, last: Floats, h: float) -> Floats:
+def magnus(twists: Floats, h: float) -> Floats:
     """Return by which twist (6,), held for a second, a body moves whose twist changes, by a sixth-order expansion.
 
     The coefficients are those of Blanes, Casas and Ros; the brackets change sign because the twist stands on the right.
 
     Args:
-        first: Twist at the first of three Gauss points (6,), body axes.
-        middle: At the second.
-        last: At the third.
+        twists: At three Gauss points (3, 6), body axes.
         h: Length of the motion, s.
     """
-    a, b, c = pin.Motion(first), pin.Motion(middle), pin.Motion(last)
+    a, b, c = (pin.Motion(twist) for twist in twists)
     one, two = b * h, (c - a) * (_SQRT_15 / 3 * h)
     three = (c - b * 2.0 + a) * (10 / 3 * h)
     fourth = two.cross(one)
@@ -70,7 +68,7 @@ def ways_to_nodes(twists: Floats, h: float) -> Floats:
     """
     nodes, _ = gauss_points(len(twists))
     on_the_way = _on_the_way(len(twists)) @ twists
-    return np.array([magnus(*points, node * h) for points, node in zip(on_the_way, nodes.tolist(), strict=True)])
+    return np.array([magnus(points, node * h) for points, node in zip(on_the_way, nodes.tolist(), strict=True)])
 
 
 def places_on_hold(model: pin.Model, q: Floats, rates: Floats, h: float, twists: Floats) -> Floats:
@@ -117,7 +115,7 @@ def munthe_kaas(
     h: float,
     velocity: Callable[[Floats, float], Floats],
     axes: Axes | None = None,
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[Floats, Floats]:
     """Take a step of the classical fourth order in the coordinates u = difference(q, .) about the step's start.
 
     There u_dot = d(difference)/dq v, which carries the curvature of SE(3) exactly.
@@ -131,23 +129,21 @@ def munthe_kaas(
         axes: Rotation from base axes to others at a configuration; None for base axes.
 
     Returns:
-        The configuration at the end (nq,), the integral of the base twist (6,), base axes, and the same in the other
-        axes.
+        The configuration at the end (nq,), and the integral of the base twist in base axes and in the others (2, 6).
     """
 
-    def slope(u: Floats, ahead: float) -> tuple[Floats, Floats, Floats]:
+    def slope(u: Floats, ahead: float) -> tuple[Floats, Floats]:
         stage = pin.integrate(model, q, u)
         v = velocity(stage, ahead)
-        return pin.dDifference(model, q, stage, pin.ARG1) @ v, v[:6], seen(stage, v[:6])
+        return pin.dDifference(model, q, stage, pin.ARG1) @ v, seen(stage, v[:6])
 
     def seen(stage: Floats, twist: Floats) -> Floats:
         R = None if axes is None else axes(stage)
-        return twist if R is None else turned(R, twist)
+        return np.array([twist, twist if R is None else turned(R, twist)])
 
-    u1, t1, s1 = start, start[:6], seen(q, start[:6])
-    u2, t2, s2 = slope(0.5 * h * u1, 0.5 * h)
-    u3, t3, s3 = slope(0.5 * h * u2, 0.5 * h)
-    u4, t4, s4 = slope(h * u3, h)
+    u1, t1 = start, seen(q, start[:6])
+    u2, t2 = slope(0.5 * h * u1, 0.5 * h)
+    u3, t3 = slope(0.5 * h * u2, 0.5 * h)
+    u4, t4 = slope(h * u3, h)
     moved = (h / 6.0) * (t1 + 2.0 * t2 + 2.0 * t3 + t4)
-    along = (h / 6.0) * (s1 + 2.0 * s2 + 2.0 * s3 + s4)
-    return pin.integrate(model, q, (h / 6.0) * (u1 + 2.0 * u2 + 2.0 * u3 + u4)), moved, along
+    return pin.integrate(model, q, (h / 6.0) * (u1 + 2.0 * u2 + 2.0 * u3 + u4)), moved

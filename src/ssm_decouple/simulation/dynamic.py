@@ -19,7 +19,7 @@ from ssm_decouple.model.robot import UNLIMITED, Robot
 from ssm_decouple.model.tree import Tree
 from ssm_decouple.simulation import physics
 from ssm_decouple.simulation.motion import build_motion, flagged_spans, rotations_to, twist_along
-from ssm_decouple.simulation.steps import Moved, after_jump, between
+from ssm_decouple.simulation.steps import after_jump, between
 
 Floats = NDArray[np.float64]
 
@@ -280,12 +280,12 @@ class DynamicMotion:
         """Return the rate b (k,) about the protected directions that takes back what the gyros have told."""
         return -self.settings.feedback_gain * self.measured if self.settings.feedback_gain else None
 
-    def move(self, rates: Floats, t: float, t_next: float) -> Moved:
+    def move(self, rates: Floats, t: float, t_next: float) -> tuple[Floats, Floats]:
         """Hold commanded joint rates (n,) from t to t_next.
 
         Returns:
-            The configuration of the law's robot (nq,) then, and the integral of the base twist (6,), in base axes and
-            in those of the law's directions.
+            The configuration of the law's robot (nq,) then, and the integral of the base twist (2, 6), in base axes
+            and in those of the law's directions.
 
         Raises:
             FloatingPointError: the motion has diverged; the message says when.
@@ -313,7 +313,7 @@ class DynamicMotion:
         velocities = np.array([first, self._law_velocity()])
         if self.settings.servo is None:
             velocities = after_jump(velocities, rates, twist, dt)
-        return end, twist, between(self.law, np.array([start, end]), velocities, twist, dt)
+        return end, np.array([twist, between(self.law, np.array([start, end]), velocities, twist, dt)])
 
     def sample(self) -> None:
         """Remember the state for the record."""

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.motion import robot_of, sum_along, twist_along
-from ssm_decouple.simulation.steps import after_jump, between, hold_rates, hold_twist
+from ssm_decouple.simulation.steps import HOLDS, after_jump, between
 
 Floats = NDArray[np.float64]
 
@@ -51,20 +51,18 @@ def integral_along(motion: xr.Dataset, U_twist: Floats, frame: str) -> Floats:
     configurations, base = motion.configuration.values, motion.base_twist_integral.values
     if frame == "base":
         return base @ U_twist
-    law, time, velocities, method = _bystander(motion, frame), motion.time.values, _velocities(motion), motion.attrs["method"]
+    law, velocities, hold = _bystander(motion, frame), _velocities(motion), HOLDS.get(motion.attrs["method"])
     rates, prescribed = motion.joint_rates.values, _rates_are_prescribed(motion)
     along = np.zeros_like(base)
-    for i, h in enumerate(np.diff(time).tolist()):
-        if method in HOLDS:
-            moved = HOLDS[method](law, configurations[i], velocities[i], h)[2]
+    for i, h in enumerate(np.diff(motion.time.values).tolist()):
+        moved, ends = base[i + 1] - base[i], velocities[i : i + 2]
+        if hold is not None:
+            moved = hold(law, configurations[i], velocities[i], h)[1][1]
         else:
-            ends = after_jump(velocities[i : i + 2], rates[i], base[i + 1] - base[i], h) if prescribed else velocities[i : i + 2]
-            moved = between(law, configurations[i : i + 2], ends, base[i + 1] - base[i], h)
+            ends = after_jump(ends, rates[i], moved, h) if prescribed else ends
+            moved = between(law, configurations[i : i + 2], ends, moved, h)
         along[i + 1] = along[i] + moved
     return sum_along(U_twist, frame, along, configurations)
-
-
-HOLDS = {"explicit": hold_twist, "held": hold_rates}
 
 
 def _velocities(motion: xr.Dataset) -> Floats:

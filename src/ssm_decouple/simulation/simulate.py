@@ -26,7 +26,7 @@ from ssm_decouple.errors import (
 )
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
 from ssm_decouple.simulation.motion import build_motion, error_of, judge
-from ssm_decouple.simulation.steps import STEPS, Demand, Moved, Pace, Reference, Wanted, sample_times
+from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted, sample_times
 
 Floats = NDArray[np.float64]
 Method = Literal["explicit", "held", "rk4"]
@@ -175,7 +175,7 @@ class _Run:
         """Move to the next sample and ask the law there."""
         i, time = self.done, self.time
         if i > 0:
-            self.configurations[i], *moved = self._move(i)
+            self.configurations[i], moved = self._move(i)
             self.twists[:, i] = self.twists[:, i - 1] + moved
         self.targets[i], velocity = self.demand.reference(time[i])
         middle = time[i] + self.leads[i]
@@ -188,7 +188,7 @@ class _Run:
         self.law.evaluate(seen, self.targets[i], velocity, self.values[i], previous, wanted, pace, time[i])
         self.done = i + 1
 
-    def _move(self, i: int) -> Moved:
+    def _move(self, i: int) -> tuple[Floats, Floats]:
         span = (self.time[i - 1], self.time[i])
         if self.dynamic is not None:
             return self.dynamic.move(self.rates[i - 1], *span)
@@ -204,7 +204,9 @@ class _Run:
         """Return the motion so far."""
         law, done, time = self.law, self.done, self.time[: self.done]
         record = partial(build_motion, law) if self.dynamic is None else self.dynamic.record
-        motion = record(time, self.configurations[:done], self.values[:done], self.twists[:, :done], self.targets[:done])
+        motion = record(
+            time, self.configurations[:done], self.values[:done], self.twists[:, :done], self.targets[:done]
+        )
         outcome = judge(time, error_of(motion), self.settings["arrival_tolerance"], 1.0 / law.layout.slowest_gain)
         motion.attrs |= {
             "method": "dynamic" if self.dynamic is not None else self.method,

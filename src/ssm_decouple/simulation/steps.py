@@ -1,7 +1,7 @@
 """From one sample to the next: how joints and base move under a command.
 
-Each step returns the next configuration and the integral of the base twist (6,) over the step twice: in base axes, and
-in the axes in which the law's directions are fixed, as these turn along the motion that the step makes.
+Each step returns the next configuration and the integral of the base twist over the step (2, 6): in base axes, and in
+the axes in which the law's directions are fixed, as these turn along the motion that the step makes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 
 from ssm_decouple.control.law import GAUSS, SelectiveLaw
 from ssm_decouple.errors import InputError, as_positive
-from ssm_decouple.momentum.flow import gauss_points, magnus, munthe_kaas, places_on_hold, quadrature_along, ways_to_nodes
+from ssm_decouple.momentum.flow import (
+    gauss_points,
+    magnus,
+    munthe_kaas,
+    places_on_hold,
+    quadrature_along,
+    ways_to_nodes,
+)
 
 Floats = NDArray[np.float64]
 Reference = Callable[[float], tuple[Floats, Floats]]  # time to target position and velocity
@@ -34,13 +41,13 @@ class Demand(NamedTuple):
     protected_rate: Wanted
 
 
-Moved = tuple[Floats, Floats, Floats]  # configuration (nq,), the twist's integral (6,) in base axes and in the law's
-Step = Callable[[SelectiveLaw, Demand, Floats, Floats, float, float], Moved]
+Step = Callable[[SelectiveLaw, Demand, Floats, Floats, float, float], tuple[Floats, Floats]]
+Hold = Callable[[SelectiveLaw, Floats, Floats, float], tuple[Floats, Floats]]
 
 JUDGING = 5  # Gauss points for integrals over a step, more than any law plans with, so that they judge it
 
 
-def hold_twist(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> Moved:
+def hold_twist(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> tuple[Floats, Floats]:
     """Hold joint rates and base twist, together v (6 + n,): one Euler step on SE(3), how we read the paper."""
     model = law.robot.model
     moved = along = h * v[:6]
@@ -48,10 +55,10 @@ def hold_twist(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> Moved:
         nodes, _ = gauss_points(JUDGING)
         places = np.array([pin.integrate(model, q, node * h * v) for node in nodes.tolist()])
         along = quadrature_along(law.rotation_to_axes, places, np.tile(v[:6], (JUDGING, 1)), h)
-    return pin.integrate(model, q, h * v), moved, along
+    return pin.integrate(model, q, h * v), np.array([moved, along])
 
 
-def hold_rates(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> Moved:
+def hold_rates(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> tuple[Floats, Floats]:
     """Hold the joint rates of v (6 + n,); the base follows by a sixth-order Magnus expansion on three Gauss points.
 
     In base axes its twist depends on the joints alone, so the base pose at those points is not needed. The integrals of
@@ -61,34 +68,41 @@ def hold_rates(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> Moved:
     """
     model, rates = law.robot.model, v[6:]
     if law.momentum.any():
-        return munthe_kaas(
-            model, q, v, h, lambda x, _: np.r_[law.base_twist(x, rates), rates], law.rotation_to_axes
-        )
+        return munthe_kaas(model, q, v, h, lambda x, _: np.r_[law.base_twist(x, rates), rates], law.rotation_to_axes)
     turning = np.r_[np.zeros(6), rates]
 
     def twist(node: float) -> Floats:
         return law.base_twist(pin.integrate(model, q, node * h * turning), rates)
 
-    first, middle, last = (twist(node) for node, _ in GAUSS[3])
+    base = magnus(np.array([twist(node) for node, _ in GAUSS[3]]), h)
     nodes, weights = gauss_points(JUDGING)
     twists = np.array([twist(node) for node in nodes.tolist()])
     moved = along = h * np.sum(weights[:, None] * twists, axis=0)
     if law.directions[1] != "base":
         along = quadrature_along(law.rotation_to_axes, places_on_hold(model, q, rates, h, twists), twists, h)
-    return pin.integrate(model, q, np.r_[magnus(first, middle, last, h), h * rates]), moved, along
+    return pin.integrate(model, q, np.r_[base, h * rates]), np.array([moved, along])
 
 
-def explicit(law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float) -> Moved:
+HOLDS: dict[str, Hold] = {"explicit": hold_twist, "held": hold_rates}
+
+
+def explicit(
+    law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float
+) -> tuple[Floats, Floats]:
     """Hold the command as it is."""
     return hold_twist(law, q, values[: law.robot.model.nv], t_next - t)
 
 
-def held(law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float) -> Moved:
+def held(
+    law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float
+) -> tuple[Floats, Floats]:
     """Hold the joint rates of the command."""
     return hold_rates(law, q, values[: law.robot.model.nv], t_next - t)
 
 
-def runge_kutta(law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float) -> Moved:
+def runge_kutta(
+    law: SelectiveLaw, demand: Demand, q: Floats, values: Floats, t: float, t_next: float
+) -> tuple[Floats, Floats]:
     """Call the law within the step too, by the classical fourth-order method."""
     model, buffer, at_rest = law.robot.model, np.empty(law.size), np.zeros(law.robot.n_joints)
 

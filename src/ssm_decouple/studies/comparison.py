@@ -14,9 +14,9 @@ import xarray as xr
 
 from ssm_decouple.control.schedule import Schedule
 from ssm_decouple.files import written_whole
-from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
-from ssm_decouple.simulation.motion import error_of, protected_integral, robot_of, twist_along
+from ssm_decouple.simulation.motion import error_of, robot_of
+from ssm_decouple.simulation.replay import integral_along, rates_along
 from ssm_decouple.studies.case import Case
 
 LAWS = ("none", "selective", "reactionless")
@@ -165,11 +165,7 @@ def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[An
     U_c, frame = np.array(json.loads(motion.attrs["case_U_c"])).reshape(6, -1), motion.attrs["case_frame"]
     if np.array_equal(U_c, motion.U_c.values) and frame == json.loads(motion.attrs["law"])["frame"]:
         return _while_on(motion)
-    twists = np.hstack([motion.base_linear_velocity.values, motion.base_angular_velocity.values])
-    robot, configurations = _robot_with(frame, motion), motion.configuration.values
-    rate = twist_along(U_c, frame, twists, configurations, robot)
-    angle = protected_integral(U_c, frame, motion.base_twist_integral.values, configurations, robot)
-    return rate, angle
+    return rates_along(motion, U_c, frame), integral_along(motion, U_c, frame)
 
 
 def _while_on(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
@@ -190,10 +186,6 @@ def _while_on(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[Any,
     return rate, angle
 
 
-def _robot_with(frame: str, motion: xr.Dataset) -> Robot | None:
-    return None if frame in ("base", "inertial") else robot_of(motion)
-
-
 def largest_rotation_deg(motion: xr.Dataset, protection: Protection | Schedule) -> float:
     """Return the largest true rotation of the base about directions, deg, whatever the motion's law protects.
 
@@ -203,9 +195,7 @@ def largest_rotation_deg(motion: xr.Dataset, protection: Protection | Schedule) 
     """
     turning = protection.U_twist.copy()
     turning[:3] = 0.0
-    twists, configurations = motion.base_twist_integral.values, motion.configuration.values
-    robot = _robot_with(protection.frame, motion)
-    turned = protected_integral(turning, protection.frame, twists, configurations, robot)
+    turned = integral_along(motion, turning, protection.frame)
     return float(np.rad2deg(np.abs(turned).max(initial=0.0)))
 
 
