@@ -47,14 +47,28 @@ Hold = Callable[[SelectiveLaw, Floats, Floats, float], tuple[Floats, Floats]]
 JUDGING = 5  # Gauss points for integrals over a step, more than any law plans with, so that they judge it
 
 
+def integrals(law: SelectiveLaw, places: Floats | None, twists: Floats, h: float) -> Floats:
+    """Return the integral of the base twist over a step (2, 6), in base axes and in the law's.
+
+    Args:
+        law: Its directions name the axes.
+        places: Configurations at Gauss nodes (m, nq); not needed where the law's axes are base axes.
+        twists: Base twists there (m, 6), base axes.
+        h: Length of the step, s.
+    """
+    moved = h * np.sum(gauss_points(len(twists))[1][:, None] * twists, axis=0)
+    if places is None or law.directions[1] == "base":
+        return np.array([moved, moved])
+    return np.array([moved, quadrature_along(law.rotation_to_axes, places, twists, h)])
+
+
 def hold_twist(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> tuple[Floats, Floats]:
     """Hold joint rates and base twist, together v (6 + n,): one Euler step on SE(3), how we read the paper."""
-    model = law.robot.model
-    moved = along = h * v[:6]
-    if law.directions[1] != "base":
-        nodes, _ = gauss_points(JUDGING)
-        places = np.array([pin.integrate(model, q, node * h * v) for node in nodes.tolist()])
-        along = quadrature_along(law.rotation_to_axes, places, np.tile(v[:6], (JUDGING, 1)), h)
+    model, moved = law.robot.model, h * v[:6]
+    if law.directions[1] == "base":
+        return pin.integrate(model, q, h * v), np.array([moved, moved])
+    places = np.array([pin.integrate(model, q, node * h * v) for node in gauss_points(JUDGING)[0].tolist()])
+    along = quadrature_along(law.rotation_to_axes, places, np.tile(v[:6], (JUDGING, 1)), h)
     return pin.integrate(model, q, h * v), np.array([moved, along])
 
 
@@ -64,23 +78,28 @@ def hold_rates(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> tuple[Float
     In base axes its twist depends on the joints alone, so the base pose at those points is not needed. The integrals of
     the twist are taken on JUDGING points; in other axes the base is led to each of them by collocation.
 
-    With momentum on board the twist does depend on the attitude, and the fourth-order method takes its place.
+    With momentum on board the twist does depend on the attitude, and the fourth-order method leads to the end and to
+    the JUDGING points.
     """
     model, rates = law.robot.model, v[6:]
+    turning, nodes = np.r_[np.zeros(6), rates], gauss_points(JUDGING)[0].tolist()
     if law.momentum.any():
-        return munthe_kaas(model, q, v, h, lambda x, _: np.r_[law.base_twist(x, rates), rates], law.rotation_to_axes)
-    turning = np.r_[np.zeros(6), rates]
+
+        def lead(time: float) -> Floats:
+            return munthe_kaas(model, q, v, time, lambda x, _: np.r_[law.base_twist(x, rates), rates])[0]
+
+        end, places = lead(h), np.array([lead(node * h) for node in nodes])
+        twists = np.array([law.base_twist(place, rates) for place in places])
+        return end, integrals(law, places, twists, h)
 
     def twist(node: float) -> Floats:
         return law.base_twist(pin.integrate(model, q, node * h * turning), rates)
 
     base = magnus(np.array([twist(node) for node, _ in GAUSS[3]]), h)
-    nodes, weights = gauss_points(JUDGING)
-    twists = np.array([twist(node) for node in nodes.tolist()])
-    moved = along = h * np.sum(weights[:, None] * twists, axis=0)
-    if law.directions[1] != "base":
-        along = quadrature_along(law.rotation_to_axes, places_on_hold(model, q, rates, h, twists), twists, h)
-    return pin.integrate(model, q, np.r_[base, h * rates]), np.array([moved, along])
+    twists = np.array([twist(node) for node in nodes])
+    # In base axes it does not matter where the base is.
+    places = None if law.directions[1] == "base" else places_on_hold(model, q, rates, h, twists)
+    return pin.integrate(model, q, np.r_[base, h * rates]), integrals(law, places, twists, h)
 
 
 HOLDS: dict[str, Hold] = {"explicit": hold_twist, "held": hold_rates}
