@@ -205,7 +205,7 @@ class Engine(ABC):
 
         def judge(part: slice, history: Floats) -> None:
             errors[part] = history[:, -1]
-            _judge(times, history, tolerance, 1.0 / law.gain, outcomes[part], outcome_times[part])
+            _judge(times, history, tolerance, 1.0 / law.layout.slowest_gain, outcomes[part], outcome_times[part])
 
         self._move(law, joints, poses, wanted, times, record, judge, progress)
         record[np.isnan(errors)] = np.nan

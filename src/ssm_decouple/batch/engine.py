@@ -108,7 +108,7 @@ class Batch(Engine):
             history = np.empty((times.size, count))
             kept[:] = 0.0
             kept[:, rows.SMALLEST : rows.HIGHEST] = np.inf
-            kept[:, rows.HIGHEST :] = -np.inf
+            kept[:, rows.HIGHEST : rows.LATEST] = -np.inf
             for i, hold in enumerate(holds):
                 if stop.is_set():
                     break

@@ -566,20 +566,21 @@ def moved(pose: Array, twist: Array, time: Array) -> Array:
 def start_record(pose: Array) -> Array:
     """Return what is kept of a motion (rows.RECORD_SIZE, ..) before its first sample."""
     empty = np.zeros(rows.RECORD_SIZE)
-    empty[rows.SMALLEST : rows.HIGHEST], empty[rows.HIGHEST :] = np.inf, -np.inf
+    empty[rows.SMALLEST : rows.HIGHEST], empty[rows.HIGHEST : rows.LATEST] = np.inf, -np.inf
     return jnp.broadcast_to(_column(empty, pose.ndim - 1), (rows.RECORD_SIZE, *pose.shape[1:]))
 
 
 def kept(record: Array, told: Command, pose: Array, time: Array) -> Array:
     """Return the record brought up to date at a sample, whose command is held for a time, s; as `rows.advance`."""
     x, y, z, w = pose[3:]
-    attitude = jnp.stack(
+    within = jnp.stack(
         [
             jnp.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
             jnp.arcsin(jnp.clip(2.0 * (w * y - z * x), -1.0, 1.0)),
             jnp.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
         ]
     )
+    attitude = within + 2.0 * np.pi * jnp.rint((record[rows.LATEST :] - within) / (2.0 * np.pi))
     rates, leaks = told.joint_rates, jnp.abs(told.protected_rate)
     return jnp.concatenate(
         [
@@ -588,6 +589,7 @@ def kept(record: Array, told: Command, pose: Array, time: Array) -> Array:
             jnp.maximum(record[rows.LEAK], jnp.max(leaks, axis=0, initial=0.0))[None],
             jnp.minimum(record[rows.SMALLEST], told.smallest_singular_value)[None],
             jnp.minimum(record[rows.LOWEST : rows.HIGHEST], attitude),
-            jnp.maximum(record[rows.HIGHEST :], attitude),
+            jnp.maximum(record[rows.HIGHEST : rows.LATEST], attitude),
+            attitude,
         ]
     )

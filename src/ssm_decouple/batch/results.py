@@ -118,9 +118,10 @@ class Motions:
         final_error: Distance to the target at the end (N,), m.
         joint_travel: Norm of the joint rates integrated over time (N,), rad (and m, of sliding joints).
         peak_rate: Largest rate of any joint (N,), rad/s or m/s.
-        protected_rate: Largest rate along a protected direction of the law, abs(J_sub q_dot) (N,), rad/s (m/s of
-            directions that shift): rounding.
-        base_rotation: Base roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), peak to peak (N, 3), rad.
+        protected_rate: Largest rate along a protected direction of the law at a sample, abs(J_sub q_dot) (N,), rad/s
+            (m/s of directions that shift): rounding.
+        base_rotation: Base roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), peak to peak (N, 3), rad; each is
+            counted on beyond half a turn.
         smallest_singular_value: Of J_gt N_sub, the smallest on the way (N,), m.
         configuration: Pinocchio configuration at the end (N, nq).
     """

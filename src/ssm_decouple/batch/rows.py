@@ -23,7 +23,8 @@ LEAK = 2  # largest rate along a protected direction
 SMALLEST = 3  # smallest singular value
 LOWEST = 4  # 3: roll, pitch and yaw at their lowest
 HIGHEST = 7  # 3: at their highest
-RECORD_SIZE = 10
+LATEST = 10  # 3: as they are now, counted on beyond half a turn
+RECORD_SIZE = 13
 
 
 @compiled
@@ -73,12 +74,17 @@ def move_pose(pose: Floats, twist: Floats, time: float) -> None:
 
 @compiled
 def keep_attitude(pose: Floats, record: Floats) -> None:
-    """Widen the ranges of roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), to hold those of a pose."""
+    """Widen the ranges of roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), to hold those of a pose.
+
+    Each goes on from where it was before, so that half a turn is no jump.
+    """
     x, y, z, w = pose[3], pose[4], pose[5], pose[6]
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = np.arcsin(min(max(2.0 * (w * y - z * x), -1.0), 1.0))
     yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    for i, angle in enumerate((roll, pitch, yaw)):
+    for i, within in enumerate((roll, pitch, yaw)):
+        angle = within + 2.0 * np.pi * np.rint((record[LATEST + i] - within) / (2.0 * np.pi))
+        record[LATEST + i] = angle
         record[LOWEST + i] = min(record[LOWEST + i], angle)
         record[HIGHEST + i] = max(record[HIGHEST + i], angle)
 

@@ -18,7 +18,14 @@ from ssm_decouple.model.plant import Plant
 from ssm_decouple.model.robot import UNLIMITED, Robot
 from ssm_decouple.model.tree import Tree
 from ssm_decouple.simulation import physics
-from ssm_decouple.simulation.motion import build_motion, flagged_spans, rotations_to, twist_along
+from ssm_decouple.simulation.motion import (
+    build_motion,
+    flagged_spans,
+    joint_positions,
+    rotations_to,
+    twist_along,
+    wheel_momenta,
+)
 from ssm_decouple.simulation.steps import after_jump, between
 
 Floats = NDArray[np.float64]
@@ -351,8 +358,14 @@ class DynamicMotion:
             "end_effector_position": points,
             "end_effector_error": np.linalg.norm(motion.target_position.values - points, axis=1),
         }
+        own = np.hstack([velocities[:, :6], velocities[:, 6 + self.driven]])
+        moved = 0.5 * np.diff(time)[:, None] * (own[1:, 6:] + own[:-1, 6:])
+        replaced["joint_positions"] = joint_positions(self.law.robot.model, seen, moved)
+        if self.law.robot.wheel_names:
+            replaced["wheel_momentum"] = wheel_momenta(self.plant.robot.model, self.law.robot.wheel_names, velocities)
         for name, values in replaced.items():
             motion[name].values = values
+        motion["protected_rate"].attrs["long_name"] = "U_c^T (base twist): the truth at the sample"
         names = self.plant.robot.joint_names
         motion = motion.assign_coords(
             hinge=[names[place] for place in self.plant.hinges],

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
@@ -40,16 +41,20 @@ class Outcome:
     error: float
 
 
-def judge(time: Floats, error: Floats, tolerance: float, time_constant: float) -> Outcome:
+def judge(
+    time: Floats, error: Floats, tolerance: float, time_constant: float, target_way: Floats | None = None
+) -> Outcome:
     """Say how a motion ended.
 
-    A motion is stalled when, to its end, the error never again shrinks by STALL_PROGRESS within one time constant.
+    A motion is stalled when, to its end, the error never again shrinks by STALL_PROGRESS within one time constant. What
+    a moving target adds to it in that time, at most, has to be shed too: who follows at a distance is not stalled.
 
     Args:
         time: Sample times (m,), s.
         error: Distances to the target (m,), m.
         tolerance: Distance, m, within which the end-effector has arrived.
         time_constant: 1 / k_p, s.
+        target_way: How far the target has moved since the start (m,), in the error's unit; None if it rests.
 
     Returns:
         The outcome.
@@ -59,7 +64,9 @@ def judge(time: Floats, error: Floats, tolerance: float, time_constant: float) -
         return Outcome("converged", float(time[outside[-1] + 1] if outside.size else time[0]), float(error[-1]))
     earlier = np.searchsorted(time, time - time_constant * (1 + 1e-9))
     complete = time - time[0] >= time_constant * (1 - 1e-9)
-    shrinking = ~complete | (error <= (1 - STALL_PROGRESS) * error[np.minimum(earlier, np.arange(time.size))])
+    earlier = np.minimum(earlier, np.arange(time.size))
+    before = error[earlier] if target_way is None else error[earlier] + (target_way - target_way[earlier])
+    shrinking = ~complete | (error <= (1 - STALL_PROGRESS) * before)
     if shrinking[-1]:
         return Outcome("running", float(time[-1]), float(error[-1]))
     first = int(np.flatnonzero(shrinking)[-1]) + 1
@@ -73,7 +80,12 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "joint_rates": (("time", "joint"), "rad/s or m/s", "joint", "commanded joint rates"),
     "base_position": (("time", "axis"), "m", "inertial", "origin of the base frame"),
     "base_quaternion": (("time", "quaternion"), "1", "base to inertial", "base attitude, x y z w"),
-    "base_rpy": (("time", "axis"), "rad", "base to inertial", "roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll)"),
+    "base_rpy": (
+        ("time", "axis"),
+        "rad",
+        "base to inertial",
+        "roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll), without jumps at +-pi",
+    ),
     "base_linear_velocity": (("time", "axis"), "m/s", "base", "velocity of the base origin"),
     "base_angular_velocity": (("time", "axis"), "rad/s", "base", "angular velocity of the base"),
     "base_twist_integral": (("time", "twist"), "m, rad", "base", "integral of the base twist from the start"),
@@ -92,11 +104,16 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "end_effector_position": (("time", "axis"), "m", "inertial", "end-effector"),
     "target_position": (("time", "axis"), "m", "inertial", "where the end-effector should be"),
     "end_effector_error": (("time",), "m", "", "distance from the end-effector to the target"),
-    "smallest_singular_value": (("time",), "m", "", "smallest singular value of J_gt N_sub"),
+    "smallest_singular_value": (
+        ("time",),
+        "m",
+        "",
+        "smallest singular value of J_gt N_sub, or of the rows of level 1, in joint weights, as the law sees it",
+    ),
     "rate_scale": (("time",), "1", "", "factor that brought the joint rates inside their limits"),
     "rate_blend": (("time",), "1", "", "share of the wanted change of rates that acceleration limits allowed"),
     "plan_change": (("time",), "1", "", "relative change in the last pass of planning for the hold; settled at 1e-13"),
-    "damping": (("time",), "m2", "", "regularising scalar rho, 0 away from singularities"),
+    "damping": (("time",), "m2", "", "regularising scalar rho of level 1, 0 away from singularities"),
     "linear_momentum": (("time", "axis"), "kg m/s", "inertial", "audit: linear momentum of (q, v)"),
     "angular_momentum": (("time", "axis"), "kg m2/s", "inertial", "audit: angular momentum about the centre of mass"),
     "centre_of_mass": (
@@ -195,6 +212,15 @@ def _protected_rates(law: SelectiveLaw, configurations: Floats, values: Floats, 
     return twist_along(U_twist, axes, values[:, :6], configurations, law.robot)
 
 
+def _told_of(law: SelectiveLaw) -> dict[str, dict[str, str]]:
+    """Return what the attributes of a variable say of a motion under this law, by name."""
+    held = "mean over the coming hold, as the law plans it" if law.hold_nodes else "at the sample, as commanded"
+    told = {"protected_rate": {"long_name": f"U_c^T (base twist): {held}"}}
+    if not law.layout.usual:
+        told |= {name: {"units": "as the rows of level 1"} for name in ("smallest_singular_value", "damping")}
+    return told
+
+
 def build_motion(
     law: SelectiveLaw,
     time: Floats,
@@ -232,11 +258,11 @@ def build_motion(
 
     arrays = {
         "configuration": configurations,
-        "joint_positions": _joint_positions(model, configurations),
+        "joint_positions": joint_positions(model, configurations, np.diff(time)[:, None] * values[:-1, 6 : 6 + n]),
         "joint_rates": values[:, 6 : 6 + n],
         "base_position": configurations[:, :3],
         "base_quaternion": configurations[:, 3:7],
-        "base_rpy": attitude.as_euler("ZYX")[:, ::-1],
+        "base_rpy": np.unwrap(attitude.as_euler("ZYX")[:, ::-1], axis=0),
         "base_linear_velocity": values[:, :3],
         "base_angular_velocity": values[:, 3:6],
         "protected_rate": _protected_rates(law, configurations, values, shares is not None),
@@ -258,9 +284,10 @@ def build_motion(
         "U_c": U_twist,
         "robot_urdf": np.array(robot.urdf, dtype=object),
     }
+    told = _told_of(law)
     variables = {}
     for name, (dimensions, unit, frame, meaning) in _VARIABLES.items():
-        attributes = {"units": unit, "frame": frame, "long_name": meaning}
+        attributes = {"units": unit, "frame": frame, "long_name": meaning} | told.get(name, {})
         variables[name] = xr.Variable(dimensions, arrays[name], attributes, fastpath=True)
     coordinates = {
         "time": ("time", time, {"units": "s"}),
@@ -280,30 +307,43 @@ def build_motion(
         variables["protection_share"] = xr.Variable(("time", "protected"), shares, _SHARE, fastpath=True)
     attributes = _attributes(law)
     if robot.wheel_names:
-        stored, spans = _wheels(law, time, values)
+        stored = wheel_momenta(model, robot.wheel_names, values[:, : 6 + n])
         variables["wheel_momentum"] = xr.Variable(("time", "wheel"), stored, _WHEEL_MOMENTUM, fastpath=True)
         coordinates["wheel"] = list(robot.wheel_names)
-        attributes["saturated_wheels"] = json.dumps(spans)
+        attributes["saturated_wheels"] = json.dumps(_full_wheels(law, time, values))
     return xr.Dataset(variables, coordinates, attributes)
 
 
-def _wheels(law: SelectiveLaw, time: Floats, values: Floats) -> tuple[Floats, dict[str, list[list[float]]]]:
-    """Return the momentum about its axis of each wheel (m, wheels), and from when to when (s) each was at full speed.
+def _full_wheels(law: SelectiveLaw, time: Floats, values: Floats) -> dict[str, list[list[float]]]:
+    """Return from when to when (s) each wheel was commanded its full speed.
 
     A command is held until the next sample, so a wheel leaves saturation at the first sample that slows it down.
     """
-    robot, spans = law.robot, {}
-    stored = np.empty((len(time), len(robot.wheel_names)))
-    for i, name in enumerate(robot.wheel_names):
-        joint = robot.model.joints[robot.model.getJointId(name)]
-        axis, at = np.ravel(joint.createData().S)[3:], robot.joint_index(name)
-        spin_inertia = axis @ robot.model.inertias[joint.id].inertia @ axis
-        speed = values[:, 6 + at]
-        stored[:, i] = spin_inertia * (speed + values[:, 3:6] @ axis)
-        full = np.abs(speed) >= (1.0 - 1e-9) * law.rate_limits[at]
+    spans = {}
+    for name in law.robot.wheel_names:
+        at = law.robot.joint_index(name)
+        full = np.abs(values[:, 6 + at]) >= (1.0 - 1e-9) * law.rate_limits[at]
         if full.any():
             spans[name] = flagged_spans(time, full[:-1] if len(time) > 1 else full)
-    return stored, spans
+    return spans
+
+
+def wheel_momenta(model: pin.Model, names: Sequence[str], velocities: Floats) -> Floats:
+    """Return the momentum about its axis of each wheel (m, wheels), N m s.
+
+    Args:
+        model: Pinocchio's, in which the wheels are joints of the base.
+        names: Of the wheels.
+        velocities: Pinocchio's velocities (m, nv).
+    """
+    stored = np.empty((len(velocities), len(names)))
+    for i, name in enumerate(names):
+        joint = model.joints[model.getJointId(name)]
+        axis = np.ravel(joint.createData().S)[3:]
+        spin_inertia = axis @ model.inertias[joint.id].inertia @ axis
+        in_base = model.jointPlacements[joint.id].rotation @ axis
+        stored[:, i] = spin_inertia * (velocities[:, joint.idx_v] + velocities[:, 3:6] @ in_base)
+    return stored
 
 
 def flagged_spans(time: Floats, flags: NDArray[np.bool_]) -> list[list[float]]:
@@ -335,14 +375,23 @@ def _audit(model: pin.Model, configurations: Floats, velocities: Floats) -> tupl
     return momenta, centres
 
 
-def _joint_positions(model: pin.Model, configurations: Floats) -> Floats:
+def joint_positions(model: pin.Model, configurations: Floats, moved: Floats) -> Floats:
+    """Return joint positions (m, n); those of continuous joints, which hold cosine and sine, count on.
+
+    Args:
+        model: Pinocchio's.
+        configurations: (m, nq).
+        moved: About how far each joint goes from sample to sample (m - 1, n): a wheel may turn many times.
+    """
     positions = np.empty((configurations.shape[0], model.nv - 6))
     for i, joint in enumerate(model.joints[2:]):
         first = configurations[:, joint.idx_q]
         if joint.nq == 1:
             positions[:, i] = first
-        else:  # a continuous joint holds cosine and sine
-            positions[:, i] = np.unwrap(np.arctan2(configurations[:, joint.idx_q + 1], first))
+        else:
+            angles = np.arctan2(configurations[:, joint.idx_q + 1], first)
+            turns = np.cumsum(np.rint((moved[:, i] - np.diff(angles)) / (2.0 * np.pi)))
+            positions[:, i] = angles + 2.0 * np.pi * np.r_[0.0, turns]
     return positions
 
 

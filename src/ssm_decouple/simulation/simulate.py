@@ -25,7 +25,7 @@ from ssm_decouple.errors import (
     as_triple,
 )
 from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
-from ssm_decouple.simulation.motion import build_motion, error_of, judge
+from ssm_decouple.simulation.motion import Outcome, build_motion, error_of, judge
 from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted, sample_times
 
 Floats = NDArray[np.float64]
@@ -198,7 +198,12 @@ class _Run:
     def ended(self, tolerance: float) -> bool:
         """Say whether the end-effector has arrived or has stalled."""
         error = np.linalg.norm(self.errors[: self.done], axis=1)
-        return judge(self.time[: self.done], error, tolerance, 1.0 / self.law.layout.slowest_gain).name != "running"
+        return self._judged(error, tolerance).name != "running"
+
+    def _judged(self, error: Floats, tolerance: float) -> Outcome:
+        way = np.linalg.norm(np.diff(self.targets[: self.done], axis=0), axis=1)
+        target_way = np.r_[0.0, np.cumsum(way)] if way.any() else None
+        return judge(self.time[: self.done], error, tolerance, 1.0 / self.law.layout.slowest_gain, target_way)
 
     def record(self) -> xr.Dataset:
         """Return the motion so far."""
@@ -207,7 +212,7 @@ class _Run:
         motion = record(
             time, self.configurations[:done], self.values[:done], self.twists[:, :done], self.targets[:done]
         )
-        outcome = judge(time, error_of(motion), self.settings["arrival_tolerance"], 1.0 / law.layout.slowest_gain)
+        outcome = self._judged(error_of(motion), self.settings["arrival_tolerance"])
         motion.attrs |= {
             "method": "dynamic" if self.dynamic is not None else self.method,
             **self.settings,

@@ -88,9 +88,9 @@ def hold_rates(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> tuple[Float
         def lead(time: float) -> Floats:
             return munthe_kaas(model, q, v, time, lambda x, _: np.r_[law.base_twist(x, rates), rates])[0]
 
-        end, places = lead(h), np.array([lead(node * h) for node in nodes])
-        twists = np.array([law.base_twist(place, rates) for place in places])
-        return end, integrals(law, places, twists, h)
+        on_the_way = np.array([lead(node * h) for node in nodes])
+        twists = np.array([law.base_twist(place, rates) for place in on_the_way])
+        return lead(h), integrals(law, on_the_way, twists, h)
 
     def twist(node: float) -> Floats:
         return law.base_twist(pin.integrate(model, q, node * h * turning), rates)

@@ -221,6 +221,7 @@ class Case:
             "title": self.title,
             "case_U_c": json.dumps(self.protection.U_twist.tolist()),
             "case_frame": self.protection.frame,
+            "case_schedule": json.dumps(self.protection.settings() if isinstance(self.protection, Schedule) else None),
             "turned": json.dumps(dict(self.turned)),
         }
         return motion

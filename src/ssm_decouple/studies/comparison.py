@@ -37,9 +37,11 @@ class Summary:
         start_distance_m: End-effector to target at the start.
         final_error_m: The same at the end.
         final_position_m: Where the end-effector is at the end, inertial axes.
-        w_sub_max_rad_s: Largest base angular velocity about any of the case's protected directions. Where those are of
-            the whole twist, the largest rate along any of them: m counts as rad, here and in what follows.
-        protected_angle_deg: Largest rotation from the start about any of them, summed over the samples.
+        w_sub_max_rad_s: Largest base angular velocity about any of the case's protected directions, at the samples or,
+            of a law that plans for the hold, as mean over it. Where those are of the whole twist, the largest rate
+            along any of them: m counts as rad, here and in what follows.
+        protected_angle_deg: Largest true rotation from the start about any of them. Of a schedule, under whatever law,
+            both count while it protects the direction, the rotation from then on.
         roll_deg: Base roll, peak to peak.
         pitch_deg: Base pitch, peak to peak.
         yaw_deg: Base yaw, peak to peak.
@@ -164,19 +166,35 @@ def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[An
     """
     U_c, frame = np.array(json.loads(motion.attrs["case_U_c"])).reshape(6, -1), motion.attrs["case_frame"]
     if np.array_equal(U_c, motion.U_c.values) and frame == json.loads(motion.attrs["law"])["frame"]:
-        return _while_on(motion)
-    return rates_along(motion, U_c, frame), integral_along(motion, U_c, frame)
+        rate, angle = motion.protected_rate.values, motion.protected_angle.values
+    else:
+        rate, angle = rates_along(motion, U_c, frame), integral_along(motion, U_c, frame)
+    shares = _shares_of_case(motion, frame)
+    return (rate, angle) if shares is None else _while_on(rate, angle, shares)
 
 
-def _while_on(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Return protected rate and angle; under a schedule zero while a direction is not fully protected.
+def _shares_of_case(motion: xr.Dataset, frame: str) -> np.ndarray[Any, Any] | None:
+    """Return how far the case protects each of its directions (m, k), 0 to 1, by time; None where it always does."""
+    told = json.loads(motion.attrs.get("case_schedule", "null"))
+    if told is None:
+        return None
+    steps = [(step["start"], Protection(np.reshape(step["U_c"], (6, -1)), frame)) for step in told]
+    return _shares(Schedule(steps, hand_over=told[0]["hand_over"]), motion)
+
+
+def _shares(schedule: Schedule, motion: xr.Dataset) -> np.ndarray[Any, Any]:
+    places = zip(motion.time.values.tolist(), motion.configuration.values, strict=True)
+    return np.array([schedule.shares(*schedule.at(time, q)) for time, q in places]).reshape(-1, schedule.k)
+
+
+def _while_on(
+    rate: np.ndarray[Any, Any], angle: np.ndarray[Any, Any], shares: np.ndarray[Any, Any]
+) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Return rate and angle of directions, zero while one is not fully protected.
 
     The angle of a direction is counted from when it came to be.
     """
-    rate, angle = motion.protected_rate.values, motion.protected_angle.values
-    if "protection_share" not in motion:
-        return rate, angle
-    on = motion.protection_share.values == 1.0
+    on = shares == 1.0
     rate, angle = np.where(on, rate, 0.0), angle.copy()
     for i in range(on.shape[1]):
         begun = np.flatnonzero(on[:, i] & ~np.r_[False, on[:-1, i]])
@@ -191,11 +209,14 @@ def largest_rotation_deg(motion: xr.Dataset, protection: Protection | Schedule) 
 
     Args:
         motion: Any motion.
-        protection: The directions. Of rows of the whole twist the angular part counts.
+        protection: The directions. Of rows of the whole twist the angular part counts; under a schedule a direction
+            counts while it is fully protected, from when it came to be.
     """
     turning = protection.U_twist.copy()
     turning[:3] = 0.0
     turned = integral_along(motion, turning, protection.frame)
+    if isinstance(protection, Schedule):
+        _, turned = _while_on(turned, turned, _shares(protection, motion))
     return float(np.rad2deg(np.abs(turned).max(initial=0.0)))
 
 

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ssm_decouple.studies.case import Case
+from ssm_decouple.studies.comparison import disturbance
 
 SAMPLE_TIMES = (0.02, 0.05, 0.1, 0.2, 0.5)
 PLANS = {0: "at the sample", 1: "middle of the hold", 2: "two Gauss points", 3: "three Gauss points"}
@@ -47,7 +48,7 @@ def sampling(
     left is the law's own error.
 
     Args:
-        case: The case; its protection should be fixed in base axes.
+        case: The case.
         sample_times: Times between samples, s.
         progress: Called now and then with hold nodes, sample time and the share of that motion that is done.
 
@@ -62,7 +63,7 @@ def sampling(
             )
             tick = None if progress is None else lambda share, dt=dt, nodes=nodes: progress(nodes, dt, share)
             motion = variant.run(dt=dt, progress=tick)
-            drift = float(np.rad2deg(np.abs(motion.protected_angle.values).max(initial=0.0)))
+            drift = float(np.rad2deg(np.abs(disturbance(motion)[1]).max(initial=0.0)))
             order: float | None = None
             if before is not None and drift > 1e-14:
                 order = float(np.log(before.drift_deg / drift) / np.log(before.sample_time_s / dt))
