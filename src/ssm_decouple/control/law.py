@@ -72,7 +72,7 @@ class CommandedMotion:
     def protected_rate(self) -> Floats:
         """Constrained disturbance angular velocity w_sub = J_sub q_dot (.., k), rad/s (paper, eq. 6): rounding.
 
-        Of a law with hold nodes, its mean over the hold. Where a rate was asked for it is that rate, or what of it the
+        Of a law with hold nodes, its mean over the hold, on these nodes. Where a rate was asked for it is that rate, or what of it the
         arm and its rate limits can give. With directions of the whole twist it mixes m/s and rad/s.
         """
         return self._results(kernel.PROTECTED_RATE, self.k)
@@ -235,7 +235,7 @@ class SelectiveLaw:
     A command that is held until the next sample keeps the joints turning while J_sub moves on, so that a base which is
     still at the sample turns a little in between. With `hold_nodes` the law is posed on matrices averaged over the
     coming hold instead: at the middle (1), or at 2 or 3 Gauss points, along the motion that the command itself causes.
-    Then the *rotation* about a direction fixed in base axes is zero over the hold, to the quadrature's order.
+    Then the *rotation* about a direction is zero over the hold, to the quadrature's order, in whatever axes it is fixed.
 
     Other tasks than the end-effector's position take its place in the same formula: J_1, the rows of all tasks of level
     1, each times the root of its task's weight, stands for J_gt. A second level acts in what the protection and J_1

@@ -254,8 +254,9 @@ class ScheduledLaw(SelectiveLaw):
     ) -> None:
         """Compute a command into an array, as `SelectiveLaw.evaluate` does; the call does the same.
 
-        `protected_rate` has a number for each of the K rows. During a hand-over the command's own is that of the rows
-        which both protections have.
+        `protected_rate` has a number for each of the K rows. The command's own has the rows that are protected then,
+        and during a hand-over those of what both protections have; as of one protection it is the mean over the hold
+        where the law has hold nodes. The record of a motion has all K.
 
         Raises:
             InputError: as for `SelectiveLaw`.

@@ -93,7 +93,7 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
         ("time", "protected"),
         "rad/s, or m/s and rad/s",
         "U_c",
-        "U_c^T (base twist) as the law sees it, at the sample or as mean over the hold; in a dynamic motion the truth",
+        "U_c^T (base twist)",
     ),
     "protected_angle": (
         ("time", "protected"),
