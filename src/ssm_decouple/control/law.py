@@ -72,8 +72,8 @@ class CommandedMotion:
     def protected_rate(self) -> Floats:
         """Constrained disturbance angular velocity w_sub = J_sub q_dot (.., k), rad/s (paper, eq. 6): rounding.
 
-        Of a law with hold nodes, its mean over the hold, on these nodes. Where a rate was asked for it is that rate, or what of it the
-        arm and its rate limits can give. With directions of the whole twist it mixes m/s and rad/s.
+        Of a law with hold nodes, its mean over the hold, on these nodes. Where a rate was asked for it is that rate, or
+        what of it the arm and its rate limits can give. With directions of the whole twist it mixes m/s and rad/s.
         """
         return self._results(kernel.PROTECTED_RATE, self.k)
 
@@ -235,7 +235,8 @@ class SelectiveLaw:
     A command that is held until the next sample keeps the joints turning while J_sub moves on, so that a base which is
     still at the sample turns a little in between. With `hold_nodes` the law is posed on matrices averaged over the
     coming hold instead: at the middle (1), or at 2 or 3 Gauss points, along the motion that the command itself causes.
-    Then the *rotation* about a direction is zero over the hold, to the quadrature's order, in whatever axes it is fixed.
+    Then the *rotation* about a direction is zero over the hold, to the quadrature's order, in whatever axes it is
+    fixed.
 
     Other tasks than the end-effector's position take its place in the same formula: J_1, the rows of all tasks of level
     1, each times the root of its task's weight, stands for J_gt. A second level acts in what the protection and J_1
@@ -815,15 +816,16 @@ class SelectiveLaw:
         velocity, results = out[: model.nv], out[model.nv :]
         position, errors = results[kernel.POSITION :][:3], results[kernel.ERRORS :][: self.layout.size]
         status, change, before = kernel.OK, np.inf, velocity[6:].copy()
-        nodes = GAUSS[self.hold_nodes]
-        self._ways = hold * np.outer([node for node, _ in nodes], velocity[:6])
+        nodes, turning = GAUSS[self.hold_nodes], self._turning
+        if turning:
+            self._ways = hold * np.outer([node for node, _ in nodes], velocity[:6])
         for _ in range(PASSES):
             for total in (matrices, drift, rates, position, errors):
                 total[:] = 0.0
             for i, (_, weight) in enumerate(nodes):
                 moved = self._after(q, velocity, i)
                 pin.computeCentroidalMap(model, data, moved)
-                if self._turning:
+                if turning:
                     kernel.base_twist_map(views[0], self._J_nodes[i])
                 if self._reads_joints:
                     kernel.read_joints(moved, columns)
@@ -840,7 +842,7 @@ class SelectiveLaw:
                 else:
                     self._bring_inside(q, commanded, out, goal=previous)
             velocity[:6] = self._J_here @ velocity[6:] + self._base_drift
-            if self._turning:
+            if turning:
                 self._ways = ways_to_nodes(self._J_nodes @ velocity[6:], hold)
             change = kernel.change_of(velocity[6:], before)
             if status != kernel.OK or change <= CONVERGED:
