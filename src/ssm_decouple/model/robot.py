@@ -23,11 +23,14 @@ from ssm_decouple.errors import (
     shown,
 )
 from ssm_decouple.model.appendage import Appendage, Modes, checked_appendages, inspect_remaining_bus
-from ssm_decouple.model.folded import folded_model, has_many_fixed_links
+from ssm_decouple.model.inspection import inspect_urdf, refuse_impossible
 from ssm_decouple.model.locked import locked_urdf
 from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.payload import loaded_urdf, payload_body
-from ssm_decouple.model.urdf import inspect_urdf, parse_urdf, root_link, tip_links
+from ssm_decouple.model.plain import pinocchio_model, plain_urdf
+from ssm_decouple.model.reading import UNLIMITED as UNLIMITED
+from ssm_decouple.model.urdf import Finding, parse_urdf, root_link, tip_links
+from ssm_decouple.model.verify import refuse_other_numbers
 from ssm_decouple.model.wheels import Wheel, wheel_axes, wheeled_urdf
 from ssm_decouple.settled import Settled, fixed_array
 
@@ -36,9 +39,10 @@ if TYPE_CHECKING:
     from ssm_decouple.momentum.coupling import Coupling
 
 Floats = NDArray[np.float64]
-UNLIMITED = 1e300  # Pinocchio writes the largest double where a URDF gives no limit
 UNIT = 1e-6  # how far the length of a quaternion may be off, as in the law's kernel
 FARTHEST = 4 * np.pi  # rad: beyond it the position of a joint looks like degrees
+
+_FRAMES = (pin.FrameType.BODY, pin.FrameType.OP_FRAME, pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT)
 
 
 class Robot(Settled):
@@ -62,7 +66,8 @@ class Robot(Settled):
             holds. The robot itself stays rigid; `Plant.of(robot)` is the one that bends.
 
     Attributes:
-        urdf: The URDF text.
+        urdf: The URDF text; as given, or in plain form where other readers would read it otherwise or not at all.
+        findings: All that is suspicious in it or worth a note.
         name: As given.
         model: The `pinocchio.Model`.
         n_joints: Number n of joints after the root.
@@ -72,7 +77,7 @@ class Robot(Settled):
         end_effector: Name of the end-effector's frame; the root link where there is no joint.
         end_effector_id: Its Pinocchio frame index.
         rate_limits: Joint rate limits (n,) from the URDF, rad/s or m/s; inf where it gives none.
-        position_limits: Lower and upper joint limits (n, 2), rad or m; infinite for continuous joints.
+        position_limits: Lower and upper joint limits (n, 2), rad or m; infinite where there is none.
         mass: Total mass, kg.
         appendages: As given, a tuple.
 
@@ -87,24 +92,17 @@ class Robot(Settled):
     ) -> None:
         as_text("name", name)
         root = parse_urdf(as_text("urdf", urdf, "give the text of a URDF; load_robot(..) takes a path"), name)
-        findings = inspect_urdf(root)
-        impossible = [finding for finding in findings if finding.level == "impossible"]
-        if impossible:
-            more = f" (and {len(impossible) - 1} more: `ssm-decouple check` lists them)" if impossible[1:] else ""
-            raise ModelError(f"robot '{name}': {impossible[0]}{more}")
-        inertias = [finding for finding in findings if "principal moment" in finding.message]
-        if inertias:
-            listed = "; ".join(str(finding) for finding in inertias)
-            warnings.warn(f"robot '{name}': no solid body has such an inertia: {listed}", DecoupleWarning, stacklevel=3)
-
-        self.urdf = urdf
+        self.findings: tuple[Finding, ...] = tuple(inspect_urdf(root))
+        refuse_impossible(name, self.findings)
+        self._warn(name)
         self.name = name
+        self.urdf, reading = plain_urdf(root, urdf)
         try:
-            self.model: pin.Model = _built(root, urdf)
-        except (ValueError, RuntimeError) as error:
-            raise ModelError(f"robot '{name}': Pinocchio cannot read it: {error}") from error
+            self.model: pin.Model = pinocchio_model(root)
+            refuse_other_numbers(self.model, reading)
+        except ModelError as error:
+            raise ModelError(f"robot '{name}': {error}") from error
         self.model.gravity.setZero()  # Pinocchio's own default would be in whatever a user computes with the model
-        self._refuse_lost_mass(root)
         self._data = pin.Data(self.model)
         self._neutral: Floats = pin.neutral(self.model)
         self.n_joints: int = self.model.nv - 6
@@ -121,6 +119,14 @@ class Robot(Settled):
         self._refuse_singular_inertia()
         self._bodies = _bodies_of(self.model)
         self.appendages: tuple[Appendage, ...] = self._fitting(appendages)
+
+    def _warn(self, name: str) -> None:
+        """Warn of what probably is not as the file means it."""
+        kinds = {"principal moment": "no solid body has such an inertia", "<mimic>": "it has joints that mimic others"}
+        for words, told in kinds.items():
+            listed = "; ".join(str(finding) for finding in self.findings if words in finding.message)
+            if listed:
+                warnings.warn(f"robot '{name}': {told}: {listed}", DecoupleWarning, stacklevel=4)
 
     def with_appendages(self, appendages: Iterable[Appendage]) -> Robot:
         """Return this robot with these appendages on its root link, instead of any that it has.
@@ -217,6 +223,8 @@ class Robot(Settled):
     def _fitting(self, appendages: Iterable[Appendage]) -> tuple[Appendage, ...]:
         try:
             found = checked_appendages(appendages)
+            if not found:
+                return found
             strange = inspect_remaining_bus(parse_urdf(self.urdf, self.name), found)
         except (InputError, ModelError) as error:
             raise type(error)(f"robot '{self.name}': {error}") from error
@@ -243,17 +251,19 @@ class Robot(Settled):
 
     def _choose_end_effector(self, wanted: str | None, tips: list[str], root: str) -> str:
         frames = self.link_names
+        left_out = "".join(f"; {finding}" for finding in self.findings if "left out" in finding.message)
         if wanted is None:
             if "end_effector" in frames:
                 return "end_effector"
             if len(tips) > 1:
                 raise ModelError(
-                    f"robot '{self.name}' has {len(tips)} tips: name one as end_effector: {', '.join(tips)}"
+                    f"robot '{self.name}' has {len(tips)} tips: name one as end_effector: {', '.join(tips)}{left_out}"
                 )
             return tips[0] if tips else root
-        if not self.model.existFrame(as_text("end_effector", wanted)):
+        if not self._has_frame(as_text("end_effector", wanted)):
             raise ModelError(
                 f"robot '{self.name}' has no frame '{wanted}' for its end-effector; it has {', '.join(frames)}"
+                f"{left_out}"
             )
         return wanted
 
@@ -262,7 +272,13 @@ class Robot(Settled):
         for i, joint in enumerate(self.model.joints[2:]):
             if joint.nq == 1:
                 limits[i] = self.model.lowerPositionLimit[joint.idx_q], self.model.upperPositionLimit[joint.idx_q]
-        return fixed_array(limits)
+        return fixed_array(np.where(np.abs(limits) < UNLIMITED, limits, np.copysign(np.inf, limits)))
+
+    def _has_frame(self, name: str) -> bool:
+        try:
+            return self.frame_id(name) > 0
+        except InputError:
+            return False
 
     def frame_id(self, name: str) -> int:
         """Return the index of a link's frame, else of any other; a joint and a link may share a name.
@@ -271,20 +287,11 @@ class Robot(Settled):
             InputError: no such frame.
         """
         as_text("frame", name, f"it is the name of a frame of '{self.name}'")
-        for kinds in (pin.FrameType.BODY, pin.FrameType.OP_FRAME, pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT):
-            if self.model.existFrame(name, kinds):
-                return int(self.model.getFrameId(name, kinds))
+        for kinds in _FRAMES:
+            index = int(self.model.getFrameId(name, kinds)) if self.model.existFrame(name, kinds) else 0
+            if index:  # the first is Pinocchio's own world, which is no part of the robot
+                return index
         raise InputError(f"'{self.name}' has no frame '{name}'; its links are {', '.join(self.link_names)}")
-
-    def _refuse_lost_mass(self, root: ET.Element) -> None:
-        """Pinocchio drops an inertia that it cannot read without a word; its sum tells."""
-        written = sum(float(mass.get("value", "0")) for mass in root.findall("link/inertial/mass"))
-        read = float(pin.computeTotalMass(self.model))
-        if abs(read - written) > 1e-9 * written:
-            raise ModelError(
-                f"robot '{self.name}': its links weigh {written:g} kg but Pinocchio reads {read:g} kg of them; an "
-                "<inertial> is malformed"
-            )
 
     def refuse_changed_model(self) -> None:
         """Look whether `model` still is what the URDF says.
@@ -423,7 +430,10 @@ class Robot(Settled):
 
     @property
     def reach(self) -> float:
-        """Distance, m, from the arm's first joint to the end-effector if the arm could be pulled straight."""
+        """Distance, m, from the arm's first joint to the end-effector if the arm could be pulled straight.
+
+        It is infinite where a joint slides without limits.
+        """
         frame = self.model.frames[self.end_effector_id]
         length = float(np.linalg.norm(frame.placement.translation))
         chain = [joint for joint in self.model.supports[frame.parentJoint] if joint > 1]
@@ -504,13 +514,6 @@ class Robot(Settled):
         from ssm_decouple.model.report import Report
 
         return Report.of_robot(self)
-
-
-def _built(root: ET.Element, urdf: str) -> pin.Model:
-    def build(text: str) -> pin.Model:
-        return pin.buildModelFromXML(text, pin.JointModelFreeFlyer())
-
-    return folded_model(root, build) if has_many_fixed_links(root) else build(urdf)
 
 
 def rigid_pose(name: str, pose: pin.SE3 | ArrayLike) -> pin.SE3:
