@@ -9,6 +9,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 
+MOST_BYTES = 2 * 2**30  # of memory for one record or table
+
+
 class DecoupleError(Exception):
     """Base of every error that this package raises on purpose."""
 
@@ -92,6 +95,30 @@ def as_seed(name: str, value: int) -> int:
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise InputError(f"{name} is {value!r}; it must be a whole number from 0")
     return value
+
+
+def as_count(name: str, value: int, most: int, needs: str = "give a whole number from 1") -> int:
+    """Return a whole number from 1 to `most`: how often something is done or kept.
+
+    Raises:
+        InputError: it is none, and the message ends with `needs`, or above `most`; the message calls it `name`.
+    """
+    if not isinstance(value, (int, np.integer)) or isinstance(value, bool) or value < 1:
+        raise InputError(f"{name} is {value!r}; {needs}")
+    if value > most:
+        told = f"{value:,}" if value < 10**30 else "above 1e30"
+        raise InputError(f"{name} is {told}; {most:,} at most")
+    return int(value)
+
+
+def refuse_more_than_fits(what: str, size: float, mend: str) -> None:
+    """Refuse what would take more than MOST_BYTES of memory, before it takes any.
+
+    Raises:
+        InputError: it would; the message says how much `what` takes, and the mend.
+    """
+    if not size <= MOST_BYTES:
+        raise InputError(f"{what} would take {size / 2**30:.3g} GiB of memory, {MOST_BYTES / 2**30:g} at most; {mend}")
 
 
 def unknown(kind: str, word: str, known: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ssm_decouple.batch.base import Engine, Floats, Judge, Progress, Wanted
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import InputError, as_count
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.steps import sample_times
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 ON_PROCESSOR, ON_GPU = 128, 65536  # rows that go through each operation together
 CHUNKS = 64  # of them in a block, the unit that travels to the device and back
+MOST_CHUNK = 2**20
 IN_FLIGHT = 2  # blocks: while one is computed the next is prepared
 SAMPLES = 2**26  # of distances to the target in a block: fewer rows where motions are long
 
@@ -59,8 +60,9 @@ class JaxBatch(Engine):
         chunk: int | None = None,
     ) -> None:
         super().__init__(robot, end_effector)
-        if chunk is not None and not (isinstance(chunk, int) and chunk > 0):
-            raise InputError(f"chunk is {chunk!r}; give a positive whole number, or None for one that suits the device")
+        if chunk is not None:
+            needs = "give a positive whole number, or None for one that suits the device"
+            chunk = as_count("chunk", chunk, MOST_CHUNK, needs)
         self.device = _device(device)
         self.chunk: int = chunk or (ON_PROCESSOR if self.device.platform == "cpu" else ON_GPU)
         self._compiled: dict[tuple[Any, ...], Any] = {}

@@ -24,8 +24,8 @@ from ssm_decouple.errors import (
     as_positive,
     as_triple,
 )
-from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion
-from ssm_decouple.simulation.motion import build_motion, error_of, judge
+from ssm_decouple.simulation.dynamic import Dynamic, DynamicMotion, refuse_endless, warn_of_limits
+from ssm_decouple.simulation.motion import build_motion, error_of, judge, record_bytes
 from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted, sample_times
 
 Floats = NDArray[np.float64]
@@ -102,22 +102,25 @@ def simulate(
         it, each row with its name and `task_level`; where no task asks for a position of the end-effector, its
         target and error are not numbers. A dynamic motion has also joint_velocities, joint_torques,
         hinge_angles, tip_deflection, kinetic_energy, spring_energy, drive_work, load_work, damping_loss,
-        saturated_time, and the attributes `physics`, `appendages` (JSON: what `Appendage` is made of), `energy_error`,
-        `momentum_drift` (both relative), `largest_torques` and `saturated`: from when to when a drive stood at its
-        torque limit.
+        saturated_time, protected_angle_parts (time, cause, protected), and the attributes `physics`, `appendages`
+        (JSON: what `Appendage` is made of), `energy_error`, `momentum_drift` (both relative), `largest_torques`,
+        `saturated`: from when to when a drive stood at its torque limit, and `saturated_joints` (JSON): which ones, and
+        for which share of the time.
 
     Raises:
         InputError: an argument makes no sense; the message names it.
         DivergenceError: the numbers of a dynamic simulation run away; it carries the motion until then.
         SimulationInterrupted: Ctrl-C; it is a KeyboardInterrupt and carries the motion so far.
     """
-    time = sample_times(duration, dt)
+    time = sample_times(duration, dt, record_bytes(law))
     if not isinstance(method, Dynamic) and method not in STEPS:
         raise InputError(f"method '{method}' is unknown: use {', '.join(STEPS)} or a Dynamic")
     _refuse_unfit_method(law, method, duration, dt)
     tolerance = as_positive("arrival_tolerance", arrival_tolerance, "it must be a positive distance, m")
     reference = _reference(law, target)
     demand = Demand(reference, _smooth_pace(smooth_start), _wanted(law, protected_rate, method))
+    if isinstance(method, Dynamic):
+        refuse_endless(method, duration, dt)
     run = _Run(law, law.robot.checked(q).copy(), time, demand, method)
     if law.layout.tool_target is not None:
         _warn_out_of_reach(law, run.configurations[0], reference(0.0)[0][law.layout.tool_target])
@@ -145,7 +148,10 @@ def simulate(
         ) from None
     if progress is not None:
         progress(1.0)
-    return run.record()
+    motion = run.record()
+    if isinstance(method, Dynamic):
+        warn_of_limits(motion)
+    return motion
 
 
 class _Run:

@@ -16,6 +16,7 @@ from ssm_decouple.control.schedule import Schedule
 from ssm_decouple.files import written_whole
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.simulation.dynamic import drives_at_limits
 from ssm_decouple.simulation.motion import error_of, protected_integral, robot_of, twist_along
 from ssm_decouple.studies.case import Case
 
@@ -53,6 +54,7 @@ class Summary:
             integrator's error, zero in physics.
         saturated: In a dynamic simulation, from when to when, s, a drive stood at its torque limit.
         full_wheels: Which reaction wheels were at full speed, and from when to when, in words.
+        limited_drives: Which drives stood at their torque limits, how long, and what it cost the protection, in words.
         lost: Of a stalled motion the direction that its tasks could move least at the end, and what took it, in words.
     """
 
@@ -79,6 +81,7 @@ class Summary:
     centre_of_mass_drift_m: float
     saturated: tuple[tuple[float, float], ...] = ()
     full_wheels: str = ""
+    limited_drives: str = ""
     lost: str = ""
 
 
@@ -123,6 +126,7 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         centre_of_mass_drift_m=float(np.linalg.norm(drift, axis=1).max()),
         saturated=tuple((start, end) for start, end in json.loads(motion.attrs.get("saturated", "[]"))),
         full_wheels=full_wheels(motion),
+        limited_drives=drives_at_limits(motion),
         lost=lost_direction(motion),
     )
 

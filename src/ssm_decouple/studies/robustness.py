@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from ssm_decouple.errors import InputError, as_seed
+from ssm_decouple.errors import InputError, as_count, as_seed
 from ssm_decouple.model.perturb import Tolerances, perturbed
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.dynamic import Dynamic, Load, Sensors, Servo
@@ -18,6 +18,8 @@ from ssm_decouple.studies.comparison import largest_rotation_deg
 
 LEVELS = (0.01, 0.02, 0.05, 0.1)
 RUNS = 200
+MOST_RUNS = 10**5
+MOST_WORKERS = 1024
 FEEDBACK_GAIN = 1.0  # 1/s
 STEP = 0.02  # s: of the physics, a quarter of the servo's radian
 METRES_PER_LEVEL = 0.1  # what a tolerance of 1 stands for where lengths are concerned: 5 % is 5 mm
@@ -146,10 +148,12 @@ class Robustness:
                 raise InputError(f"level {level} is no tolerance: give shares above 0 and below 1, 0.05 for 5 %")
         if self.runs < 1:
             raise InputError(f"{self.runs} runs are no study; give at least 1")
+        as_count("runs", self.runs, MOST_RUNS)
         if not self.feedback_gain > 0:
             raise InputError(f"feedback_gain is {self.feedback_gain}; it must be positive, 1/s")
         if self.workers < 1:
             raise InputError(f"{self.workers} workers do nothing; give at least 1")
+        as_count("workers", self.workers, MOST_WORKERS)
         as_seed("seed", self.seed)
         if self.case.protection.k == 0 or np.any(self.case.protection.U_twist[:3]):
             raise InputError(f"case '{self.case.name}' needs a protection of rotation: one to three directions")

@@ -14,7 +14,7 @@ from ssm_decouple.batch import Batch
 from ssm_decouple.batch.results import Motions
 from ssm_decouple.batch.rows import move_poses, place_points
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError, as_floats, as_seed
+from ssm_decouple.errors import InputError, as_count, as_floats, as_seed
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import AXES, Protection
 from ssm_decouple.studies.case import Case
@@ -23,9 +23,11 @@ from ssm_decouple.studies.postures import MARGIN, PROTECTIONS, joint_ranges
 from ssm_decouple.studies.shares import CONFIDENCE, wilson
 
 Floats = NDArray[np.float64]
+
 Flags = NDArray[np.bool_]
 Triple = tuple[float, float, float]
 
+MOST_TARGETS = 10**6
 COUNT = 10_000
 DRAWN = 8192  # random starts that are looked at together
 TRIES = 64  # so many times before there seem to be none
@@ -568,3 +570,4 @@ def _percentiles(values: Floats, share: float) -> Triple | None:
 def _check_count(count: int) -> None:
     if not isinstance(count, int) or isinstance(count, bool) or count < 1:
         raise InputError(f"{count!r} targets are no study; give a whole number from 1")
+    as_count("count of targets", count, MOST_TARGETS)

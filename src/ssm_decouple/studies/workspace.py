@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc, t
 
 from ssm_decouple.batch.engine import Batch
-from ssm_decouple.errors import InputError, as_positive, as_seed
+from ssm_decouple.errors import InputError, as_count, as_positive, as_seed
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.studies.postures import MARGIN, PROTECTIONS, joint_ranges
@@ -38,6 +38,8 @@ BLOCKS = 16  # independent scrambles
 CHUNK = 2**16  # postures at a time
 CLIMBS = 4  # searched postures to a drawn one
 VOXELS = 2**18  # more are refused: every one keeps a posture for each protection
+MOST_SAMPLES = 10**9  # postures, and four times as many that are searched: weeks
+MOST_POINTS = 2000  # of each joint of a slice
 PER_REACH = 20.0  # voxels to a reach
 CURVE = np.geomspace(1e-6, 10.0, 141)  # m: where the distribution of sigma is counted, 20 to a decade
 
@@ -250,6 +252,7 @@ class Workspace:
         as_seed("seed", self.seed)
         if not isinstance(self.samples, int) or isinstance(self.samples, bool) or self.samples < 1:
             raise InputError(f"samples is {self.samples!r}; give a positive whole number, such as {SAMPLES}")
+        as_count("samples", self.samples, MOST_SAMPLES)
         self._ranges = joint_ranges(self.robot)
         self.grid = Grid.about(self.robot, self.voxel)
         self.margins = tuple(sorted({*MARGINS, self.margin}))
@@ -433,6 +436,7 @@ def joint_slice(
         InputError: no such joint, or one without a range.
     """
     i, j = (robot.joint_index(name) for name in joints)
+    as_count("points", points, MOST_POINTS)
     ranges = joint_ranges(robot)
     first, second = (np.linspace(low, high, points) for low, high in ranges[[i, j]])
     rows = np.tile(np.asarray(posture, dtype=float), (points * points, 1))
