@@ -17,6 +17,9 @@ Floats = NDArray[np.float64]
 T = TypeVar("T")
 
 
+MOST_BYTES = 2 * 2**30  # of memory for one record or table
+
+
 class DecoupleError(Exception):
     """Base of every error that this package raises on purpose."""
 
@@ -215,6 +218,29 @@ def as_function(name: str, value: Callable[..., T] | None) -> Callable[..., T] |
     if value is not None and not callable(value):
         raise InputError(f"{name} is {shown(value)}; it must be a function, or None")
     return value
+
+
+def as_count(name: str, value: int, most: int, needs: str = "give a whole number from 1") -> int:
+    """Return a whole number from 1 to `most`: how often something is done or kept.
+
+    Raises:
+        InputError: it is none, and the message ends with `needs`, or above `most`; the message calls it `name`.
+    """
+    count = as_whole(name, value, 1, needs)
+    if count > most:
+        told = f"{count:,}" if count < 10**30 else "above 1e30"
+        raise InputError(f"{name} is {told}; {most:,} at most")
+    return count
+
+
+def refuse_more_than_fits(what: str, size: float, mend: str) -> None:
+    """Refuse what would take more than MOST_BYTES of memory, before it takes any.
+
+    Raises:
+        InputError: it would; the message says how much `what` takes, and the mend.
+    """
+    if not size <= MOST_BYTES:
+        raise InputError(f"{what} would take {size / 2**30:.3g} GiB of memory, {MOST_BYTES / 2**30:g} at most; {mend}")
 
 
 def unknown(kind: str, word: str, known: Sequence[str]) -> str:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ssm_decouple.batch.base import Engine, Floats, Judge, Progress, Wanted
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError, as_floats, as_kind, as_whole, shown
+from ssm_decouple.errors import InputError, as_count, as_floats, as_kind, shown
 from ssm_decouple.model.origin import FAR
 from ssm_decouple.model.robot import UNIT, Robot
 from ssm_decouple.momentum.protection import Protection
@@ -28,6 +28,7 @@ if TYPE_CHECKING:
 
 ON_PROCESSOR, ON_GPU = 128, 65536  # rows that go through each operation together
 CHUNKS = 64  # of them in a block, the unit that travels to the device and back
+MOST_CHUNK = 2**20
 IN_FLIGHT = 2  # blocks: while one is computed the next is prepared
 SAMPLES = 2**26  # of distances to the target in a block: fewer rows where motions are long
 
@@ -61,13 +62,9 @@ class JaxBatch(Engine):
     ) -> None:
         super().__init__(robot, end_effector)
         self.device = _device(device)
-        usual, needs = (
-            ON_PROCESSOR if self.device.platform == "cpu" else ON_GPU,
-            "give a positive whole number, or None",
-        )
-        self.chunk: int = (
-            usual if chunk is None else as_whole("chunk", chunk, 1, f"{needs} for one that suits the device")
-        )
+        usual = ON_PROCESSOR if self.device.platform == "cpu" else ON_GPU
+        needs = "give a positive whole number, or None for one that suits the device"
+        self.chunk: int = usual if chunk is None else as_count("chunk", chunk, MOST_CHUNK, needs)
         self._compiled: dict[tuple[Any, ...], Any] = {}
 
     def __repr__(self) -> str:

@@ -15,11 +15,12 @@ from ssm_decouple.batch import lanes, rows
 from ssm_decouple.batch.base import NO_ROWS, Engine, Floats, Judge, Progress, Wanted
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import as_whole
+from ssm_decouple.errors import as_count
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 
 CONFIGURATIONS = 8192  # that a thread works on at a time
+MOST_THREADS = 1024
 MOTIONS = 256  # likewise: their matrices stay in the processor's cache
 SAMPLES = 2**22  # of errors that a thread keeps: fewer motions at a time where they are long
 
@@ -47,7 +48,8 @@ class Batch(Engine):
     def __init__(self, robot: Robot, end_effector: str | None = None, threads: int | None = None) -> None:
         super().__init__(robot, end_effector)
         needs = "give a positive whole number, or None for one a processor"
-        self.threads: int = (os.cpu_count() or 1) if threads is None else as_whole("threads", threads, 1, needs)
+        count = None if threads is None else as_count("threads", threads, MOST_THREADS, needs)
+        self.threads: int = count or os.cpu_count() or 1
 
     def __repr__(self) -> str:
         return f"Batch({self.robot!r}, end_effector={self.end_effector!r}, threads={self.threads})"

@@ -26,6 +26,8 @@ from ssm_decouple.model.urdf import (
 
 Floats = NDArray[np.float64]
 
+MOST_SEGMENTS = 500
+
 _HINGE_LIMIT = "1e9"  # rad/s and N m: URDF wants a number, and nothing drives a hinge
 
 # A plate without thickness is at the edge of the triangle inequality: rounding must not push it over, as MuJoCo, for
@@ -86,6 +88,8 @@ class Appendage:
         if not 0 <= self._number("damping_ratio") < 1:
             raise self._error("damping_ratio", "it must be from 0 to below 1, for example 0.005")
         segments = as_whole(f"appendage '{self.name}': segments", self.segments)
+        if segments > MOST_SEGMENTS:
+            raise self._error("segments", f"each is a body with a joint: {MOST_SEGMENTS} at most")
         if not np.isfinite(self._number("turn")):
             raise self._error("turn", "it must be a finite angle, rad")
         if abs(self.turn) > 2 * np.pi:

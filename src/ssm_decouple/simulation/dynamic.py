@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import warnings
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -13,7 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.control.schedule import ScheduledLaw
-from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_positive, as_seed, as_switch, shown
+from ssm_decouple.errors import (
+    DecoupleWarning,
+    InputError,
+    as_floats,
+    as_not_negative,
+    as_positive,
+    as_seed,
+    as_switch,
+    shown,
+)
 from ssm_decouple.model.massless import refuse_singular_mass_matrix
 from ssm_decouple.model.plant import Plant
 from ssm_decouple.model.robot import UNLIMITED, Robot
@@ -36,6 +46,8 @@ COARSEST = 0.5
 STEP_WORK = 2_000_000
 # Of the servo's own time, 1 / (2 pi frequency), at most: so long a piece of a joint's path is a cubic to 1e-8 rad.
 PIECE = 1.5
+MOST_STEPS = 1e8  # of physics in a motion: some twenty minutes of a six-joint arm
+NEXT_TO_NOTHING = 1e-8  # rad or m, of a protected direction: two thousandths of an arcsecond
 TINY = 1e-300  # keeps a share of nothing from being NaN
 
 # What a dynamic motion records beside the rest. name: (dimensions, unit, frame, meaning)
@@ -482,6 +494,74 @@ class DynamicMotion:
             points[i] = pin.updateFramePlacement(model, data, frame).translation
             energies[i] = pin.computeKineticEnergy(model, data, q, v)
         return momenta, centres, points, energies, carried
+
+
+def drives_at_limits(motion: xr.Dataset) -> str:
+    """Return in words which drives stood at their torque limits and what the servo made of the protection meanwhile.
+
+    Nothing where none did, or the motion has no drives.
+    """
+    joints: dict[str, float] = json.loads(motion.attrs.get("saturated_joints", "{}"))
+    if not joints:
+        return ""
+    named = ", ".join(f"{name} for {100 * share:.2g} %" for name, share in joints.items())
+    told = f"{named} of the time"
+    cost = _cost_of_limits(motion).max(initial=0.0)
+    unit = " (m count as rad)" if np.any(motion.U_c.values[:3]) else ""
+    return told + (f"; meanwhile the servo has moved the protected directions by {np.rad2deg(cost):.2g} deg{unit}")
+
+
+def warn_of_limits(motion: xr.Dataset) -> None:
+    """Warn where torque limits have made a good part of what the protected directions have moved.
+
+    Warns:
+        DecoupleWarning: it is a tenth or more, and not next to nothing.
+    """
+    largest = np.abs(motion.protected_angle.values).max(initial=0.0)
+    if np.any(_cost_of_limits(motion) > max(0.1 * largest, NEXT_TO_NOTHING)):
+        warnings.warn(
+            f"drives at their torque limits have cost protection: {drives_at_limits(motion)}, of {np.rad2deg(largest):.2g} "
+            "deg in all; larger torques help, lower rate or acceleration limits, a smooth_start, or a servo that "
+            "protects",
+            DecoupleWarning,
+            stacklevel=3,
+        )
+
+
+def _cost_of_limits(motion: xr.Dataset) -> Floats:
+    """Return how far the servo has moved each protected direction (k,), m or rad, in holds with a drive at its limit.
+
+    What it has moved that does not show in the truth, because it takes out what the plan has left, does not count.
+    """
+    flagged = np.diff(motion.saturated_time.values) > 0
+    counted = flagged[:, None] * np.ones(motion.sizes["protected"])
+    if "protection_share" in motion:
+        counted = counted * motion.protection_share.values[:-1]
+    parts = (motion.protected_angle_parts.sel(cause="servo"), motion.protected_angle)
+    sums = [np.abs(np.cumsum(counted * np.diff(part.values, axis=0), axis=0)).max(0, initial=0.0) for part in parts]
+    return np.minimum(*sums)
+
+
+def refuse_endless(settings: Dynamic, duration: float, dt: float) -> None:
+    """Refuse a motion of more physics steps than MOST_STEPS.
+
+    Args:
+        settings: The physics.
+        duration: Of the motion, s.
+        dt: Time between samples, s.
+
+    Raises:
+        InputError: it has more; the message says how many, and which step would do.
+    """
+    times = {"physics step": settings.step}
+    if settings.servo is not None and settings.servo.period is not None:
+        times["servo period"] = settings.servo.period
+    for name, time in times.items():
+        if duration / min(time, dt) > MOST_STEPS:
+            raise InputError(
+                f"a {name} of {time:g} s makes {duration / time:.3g} physics steps of {duration:g} s, {MOST_STEPS:g} "
+                f"at most: use {duration / MOST_STEPS:.3g} s or more, or a shorter duration"
+            )
 
 
 def _holding(settings: Dynamic, t: float, t_next: float) -> Floats:

@@ -226,6 +226,15 @@ def _told_of(law: SelectiveLaw) -> dict[str, dict[str, str]]:
     return told
 
 
+def record_bytes(law: SelectiveLaw) -> int:
+    """Return about how much memory a sample of a motion takes: what the law tells, what is recorded, and the way there.
+
+    That of a dynamic motion is counted, too.
+    """
+    kept = 2 * law.size + 4 * law.robot.model.nq + 8 * law.robot.n_joints + 10 * law.directions[0].shape[1]
+    return 8 * (kept + 100)
+
+
 def build_motion(
     law: SelectiveLaw,
     time: Floats,

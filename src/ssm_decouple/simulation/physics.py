@@ -90,6 +90,7 @@ TOTALS_SIZE = 16
 OK = -1  # what `advance` returns unless it has stopped
 SINGULAR = 1e-20  # square of what is left of a row, against the longest, below which the joints cannot serve it
 DIVERGED = 1e4  # rad/s or m/s: no spacecraft moves so fast
+ENOUGH = 0.02  # of what plain scaling would leave of the wanted accelerations
 AT = 1.0 - 1e-9  # of its limit, from where on a torque stands at it
 # Nodes and weights of Gauss's quadrature on [0, 1]: one node more than any law plans with.
 _ROOTS, _WEIGHTS = np.polynomial.legendre.leggauss(4)
@@ -479,62 +480,6 @@ def fitting_share(fixed: Floats, torque: Floats, limits: Floats) -> float:
 
 
 @compiled
-def servo_torque(
-    parent: Ints,
-    tree: Floats,
-    q: Floats,
-    v: Floats,
-    wanted: Floats,
-    U: Floats,
-    asked: Floats,
-    limits: Floats,
-    work: Floats,
-    torque: Floats,
-) -> bool:
-    """Fill `torque` (n,) with what gives the joints the accelerations `wanted` (n,) while the base floats.
-
-    Computed torque by the controller's own model. With directions U (6, k) of the base twist the accelerations are
-    changed, in place, so that the base accelerates along them as `asked` (k,). `work`, as large as `scratch_of` says,
-    is overwritten.
-
-    Where a torque is above its limit (n,) all of them are scaled, as rates are: one joint cut by itself would leave the
-    null space of J_sub, all together they come to the commanded rates later. With directions, what holds those is not
-    scaled as long as the limits have room for it.
-
-    Returns:
-        Whether a limit has cut the torques; the first number of the row SHARE of the scratch matrix tells which share
-        of the wanted accelerations they give.
-    """
-    n, spares = wanted.shape[0], U.shape[1] > 0
-    bodies, M, small = work[: n + 1], work[n + 1 : 2 * n + 7], work[2 * n + 7 :]
-    bias, needed, zeros = small[BIAS], small[NEEDED][:n], small[ZEROS][:n]
-    equations(parent, tree, q, v, bodies, M, bias)
-    if spares:
-        spare_base(M, bias, U, asked, small, wanted)
-    torques_for(M, bias, wanted, small, torque)
-    needed[:] = 0.0
-    zeros[:] = 0.0
-    share = fitting_share(needed, torque, limits)
-    small[SHARE, 0] = share
-    if share == 1.0:
-        return False
-    if spares:  # what it takes to spare the base, and no more
-        basis = small[BASIS][:n]
-        free_accelerations(M, bias, small, basis)
-        spare_base(M, bias, U, asked, small, basis)
-        torques_for(M, bias, basis, small, needed)
-        kept = fitting_share(zeros, needed, limits)
-        for j in range(n):
-            needed[j] *= kept  # not even that: as much of it as there is
-        share = fitting_share(needed, torque, limits) if kept == 1.0 else 0.0
-        small[SHARE, 0] = share
-    for j in range(n):
-        torque[j] = needed[j] + share * (torque[j] - needed[j])
-        torque[j] = min(max(torque[j], -limits[j]), limits[j])  # rounding
-    return True
-
-
-@compiled
 def rows_in_base(U: Floats, axes: int, body: Floats, R: Floats, out: Floats) -> None:
     """Fill `out` (6, k) with directions of the base twist (6, k) in base axes.
 
@@ -554,6 +499,116 @@ def rows_in_base(U: Floats, axes: int, body: Floats, R: Floats, out: Floats) -> 
 
 
 @compiled
+def servo_torque(
+    parent: Ints,
+    tree: Floats,
+    q: Floats,
+    v: Floats,
+    wanted: Floats,
+    U: Floats,
+    asked: Floats,
+    limits: Floats,
+    work: Floats,
+    torque: Floats,
+) -> bool:
+    """Fill `torque` (n,) with what gives the joints the accelerations `wanted` (n,) while the base floats.
+
+    Computed torque by the controller's own model. With directions U (6, k) of the base twist the accelerations are
+    changed, in place, so that the base accelerates along them as `asked` (k,). `work`, as large as `scratch_of` says,
+    is overwritten.
+
+    Returns:
+        Whether a limit (n,) has cut the torques; the first number of the row SHARE of the scratch matrix tells which
+        share of the wanted accelerations is left.
+    """
+    n = wanted.shape[0]
+    bodies, M, small = work[: n + 1], work[n + 1 : 2 * n + 7], work[2 * n + 7 :]
+    bias = small[BIAS]
+    equations(parent, tree, q, v, bodies, M, bias)
+    if U.shape[1] > 0:
+        spare_base(M, bias, U, asked, small, wanted)
+    torques_for(M, bias, wanted, small, torque)
+    return keep_limits(M, bias, U, asked, limits, small, torque)
+
+
+@compiled
+def driven_torque(
+    parent: Ints,
+    tree: Floats,
+    q: Floats,
+    v: Floats,
+    wanted: Floats,
+    braking: Floats,
+    U: Floats,
+    axes: int,
+    R: Floats,
+    limits: Floats,
+    work: Floats,
+    torque: Floats,
+) -> bool:
+    """Do what `servo_torque` does for drives that know of no directions but at their limits.
+
+    There the base is to accelerate along U (6, k), in the axes that `axes` and R tell, as it would under the servo's
+    loop on the rates alone, which asks for the accelerations `braking` (n,): it takes J_sub q_dot to what the command
+    makes of it.
+    """
+    n, k = wanted.shape[0], U.shape[1]
+    bodies, M, small = work[: n + 1], work[n + 1 : 2 * n + 7], work[2 * n + 7 :]
+    bias, zeros, needed = small[BIAS], small[ZEROS][:n], small[NEEDED][:n]
+    equations(parent, tree, q, v, bodies, M, bias)
+    torques_for(M, bias, wanted, small, torque)
+    zeros[:] = 0.0
+    if fitting_share(zeros, torque, limits) == 1.0:
+        return False
+    U_base, asked = np.empty((6, k)), np.empty(k)
+    rows_in_base(U, axes, bodies[max(axes, 0)], R, U_base)
+    torques_for(M, bias, braking, small, needed)
+    for i in range(k):
+        asked[i] = 0.0
+        for c in range(6):
+            asked[i] += U_base[c, i] * small[CHANGE, c]
+    return keep_limits(M, bias, U_base, asked, limits, small, torque)
+
+
+@compiled
+def keep_limits(
+    M: Floats, bias: Floats, U: Floats, asked: Floats, limits: Floats, small: Floats, torque: Floats
+) -> bool:
+    """Bring all torques (n,) inside their limits together where one is above its own, as rates are.
+
+    One joint cut by itself would leave the null space of J_sub; together they come to the commanded rates later. First
+    come the torques that give the base its acceleration `asked` (k,) along U (6, k) with the least change of the joints'
+    free motion; of what the servo wants beside it the share is taken that the limits allow. Where this is next to
+    nothing, plain scaling takes over, so that no drive at its limit can lock the others.
+    """
+    n = torque.shape[0]
+    needed, zeros, shares = small[NEEDED][:n], small[ZEROS][:n], small[SHARE]
+    zeros[:] = 0.0
+    plain = fitting_share(zeros, torque, limits)
+    shares[0] = plain
+    if plain == 1.0:
+        return False
+    if U.shape[1] > 0:
+        basis = small[BASIS][:n]
+        free_accelerations(M, bias, small, basis)
+        spare_base(M, bias, U, asked, small, basis)
+        torques_for(M, bias, basis, small, needed)
+        share = 0.0
+        if fitting_share(zeros, needed, limits) == 1.0:
+            share = fitting_share(needed, torque, limits)
+        trust = min(1.0, share / (ENOUGH * plain))
+        for j in range(n):
+            torque[j] = trust * (needed[j] + share * (torque[j] - needed[j])) + (1.0 - trust) * plain * torque[j]
+        shares[0] = trust * share + (1.0 - trust) * plain
+    else:
+        for j in range(n):
+            torque[j] *= plain
+    for j in range(n):
+        torque[j] = min(max(torque[j], -limits[j]), limits[j])  # rounding
+    return True
+
+
+@compiled
 def base_twist_of(parent: Ints, tree: Floats, q: Floats, rates: Floats, on_board: Floats, work: Floats) -> Floats:
     """Return the base twist (6,), base axes, that joint rates (n,) cause with a momentum on board (6,), base axes.
 
@@ -561,9 +616,7 @@ def base_twist_of(parent: Ints, tree: Floats, q: Floats, rates: Floats, on_board
     bodies afterwards.
     """
     n = q.shape[0]
-    bodies, small, whole, own, x = work[: n + 1], work[n + 1 :], np.zeros(10), np.zeros(6), np.empty(6)
-    for c in range(3):
-        x[c], x[3 + c] = on_board[c], on_board[3 + c]
+    bodies, small, whole, own, x = work[: n + 1], work[n + 1 :], np.zeros(10), np.zeros(6), on_board.copy()
     place_bodies(parent, tree, q, bodies)
     for i in range(n + 1):
         me = bodies[i]
@@ -820,10 +873,10 @@ def advance(
     q_stage, v_stage, sum_q = np.empty(N), np.empty(6 + N), np.empty(N)
     power, flows, load = np.empty(3), np.empty(3), np.zeros(6)
     u, w, sum_u, R, sum_p, p_dot = np.zeros(3), np.empty(3), np.empty(3), np.empty(9), np.empty(3), np.empty(3)
-    own_q, own_v, wanted = np.empty(n), np.empty(6 + n), np.empty(n)
+    own_q, own_v, wanted, braking = np.empty(n), np.empty(6 + n), np.empty(n), np.empty(n)
     axes, own_axes = int(settings[AXES]), int(settings[OWN_AXES])
-    spared = k if settings[PROTECTS] > 0.0 else 0
-    U_base, U_spared, asked, moved = np.empty((6, k)), np.empty((6, spared)), np.empty(spared), np.empty(6)
+    protects = settings[PROTECTS] > 0.0
+    U_base, asked, moved = np.empty((6, k)), np.empty(k), np.empty(6)
     torque, share = drives[TORQUE], own_work[2 * n + 7 + SHARE]
     turned, R_piece, per_piece = np.zeros(3), np.empty(9), int(settings[STEPS_PER_PIECE])
     if prescribed and first == 0:
@@ -842,15 +895,30 @@ def advance(
                 own_v[c] = v[c]
             for j in range(n):
                 own_q[j], own_v[6 + j] = q[driven[j]], v[6 + driven[j]]
-                wanted[j] = 2.0 * settings[RATIO] * settings[FREQUENCY] * (command[j] - own_v[6 + j])
-                wanted[j] += settings[FREQUENCY] ** 2 * (reference[j] - own_q[j])
-            if spared > 0:
-                rows_in_base(U, axes, work[0], pose, U_spared)
-            for i in range(spared):
-                asked[i] = -(settings[FREQUENCY] ** 2) * parts[TRUTH, i]
-                for c in range(6):
-                    asked[i] -= 2.0 * settings[RATIO] * settings[FREQUENCY] * U_spared[c, i] * v[c]
-            cut = servo_torque(own_parent, own_tree, own_q, own_v, wanted, U_spared, asked, limits, own_work, torque)
+                braking[j] = 2.0 * settings[RATIO] * settings[FREQUENCY] * (command[j] - own_v[6 + j])
+                wanted[j] = braking[j] + settings[FREQUENCY] ** 2 * (reference[j] - own_q[j])
+            if protects:
+                rows_in_base(U, axes, work[0], pose, U_base)
+                for i in range(k):
+                    asked[i] = -(settings[FREQUENCY] ** 2) * parts[TRUTH, i]
+                    for c in range(6):
+                        asked[i] -= 2.0 * settings[RATIO] * settings[FREQUENCY] * U_base[c, i] * v[c]
+                cut = servo_torque(own_parent, own_tree, own_q, own_v, wanted, U_base, asked, limits, own_work, torque)
+            else:
+                cut = driven_torque(
+                    own_parent,
+                    own_tree,
+                    own_q,
+                    own_v,
+                    wanted,
+                    braking,
+                    U,
+                    own_axes,
+                    pose,
+                    limits,
+                    own_work,
+                    torque,
+                )
             for j in range(n):
                 reference[j] += span * command[j]
                 if cut:

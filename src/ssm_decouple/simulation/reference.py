@@ -19,6 +19,7 @@ from ssm_decouple.settled import Settled, fixed_array
 
 Floats = NDArray[np.float64]
 
+MOST_STEPS = 10**5  # of a tumble's integration, each kept: some 1,600 turns
 _STEPS_A_TURN = 60  # at least, of the tumble's integration: keeps its interpolation as accurate as its steps
 
 
@@ -209,6 +210,13 @@ class TumblingTarget(Settled):
         now = as_number("time", time)
         if now < 0:
             raise InputError(f"the target's motion starts at time 0; {now:g} s is before")
+        ahead = (now - self._times[-1]) / self._solver.max_step
+        if len(self._times) + ahead > MOST_STEPS:
+            raise InputError(
+                f"time is {now:g} s: the target's tumble takes {len(self._times) + ahead:.3g} steps of "
+                f"{self._solver.max_step:.3g} s until then, {MOST_STEPS:g} at most; start it nearer to that time, or "
+                "let it turn more slowly"
+            )
         while now >= self._times[-1]:
             self._solver.step()
             self._times.append(self._solver.t)

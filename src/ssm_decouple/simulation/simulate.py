@@ -29,8 +29,8 @@ from ssm_decouple.errors import (
     shown,
 )
 from ssm_decouple.model.origin import far_origin
-from ssm_decouple.simulation.dynamic import DivergedError, Dynamic, DynamicMotion
-from ssm_decouple.simulation.motion import Outcome, build_motion, error_of, judge
+from ssm_decouple.simulation.dynamic import DivergedError, Dynamic, DynamicMotion, refuse_endless, warn_of_limits
+from ssm_decouple.simulation.motion import Outcome, build_motion, error_of, judge, record_bytes
 from ssm_decouple.simulation.steps import STEPS, Demand, Pace, Reference, Wanted, sample_times
 from ssm_decouple.simulation.telling import sentences, tell
 
@@ -108,9 +108,10 @@ def simulate(
         it, each row with its name and `task_level`; where no task asks for a position of the end-effector, its
         target and error are not numbers. A dynamic motion has also joint_velocities, joint_torques,
         hinge_angles, tip_deflection, kinetic_energy, spring_energy, drive_work, load_work, damping_loss,
-        saturated_time, and the attributes `physics`, `appendages` (JSON: what `Appendage` is made of), `energy_error`,
-        `momentum_drift` (both relative), `largest_torques` and `saturated`: from when to when a drive stood at its
-        torque limit.
+        saturated_time, protected_angle_parts (time, cause, protected), and the attributes `physics`, `appendages`
+        (JSON: what `Appendage` is made of), `energy_error`, `momentum_drift` (both relative), `largest_torques`,
+        `saturated`: from when to when a drive stood at its torque limit, and `saturated_joints` (JSON): which ones, and
+        for which share of the time.
 
     Raises:
         InputError: an argument makes no sense; the message names it.
@@ -120,7 +121,7 @@ def simulate(
             through as it is. An error in the middle of the motion carries the motion so far as its attribute `motion`.
     """
     as_kind("law", law, SelectiveLaw, "give a law, such as SelectiveLaw(robot, Protection('yaw'))")
-    time = sample_times(duration, dt)
+    time = sample_times(duration, dt, record_bytes(law))
     duration, dt = float(time[-1]), as_positive("dt", dt)
     if not (isinstance(method, Dynamic) or (isinstance(method, str) and method in STEPS)):
         raise InputError(f"method {shown(method)} is unknown: use {', '.join(STEPS)} or a Dynamic")
@@ -132,6 +133,8 @@ def simulate(
     tolerance = as_positive("arrival_tolerance", arrival_tolerance, "it must be a positive distance, m")
     reference = _reference(law, target)
     demand = Demand(reference, _smooth_pace(smooth_start), _wanted(law, protected_rate, method))
+    if isinstance(method, Dynamic):
+        refuse_endless(method, duration, dt)
     run = _Run(law, law.robot.checked(q).copy(), time, demand, method)
     law, reference = run.law, run.demand.reference
     if law.layout.tool_target is not None:
@@ -167,6 +170,8 @@ def simulate(
     motion = run.record()
     for sentence in sentences(motion):
         warnings.warn(sentence, DecoupleWarning, stacklevel=2)
+    if isinstance(method, Dynamic):
+        warn_of_limits(motion)
     return motion
 
 

@@ -14,7 +14,7 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.control.law import GAUSS, SelectiveLaw
-from ssm_decouple.errors import InputError, as_positive
+from ssm_decouple.errors import InputError, as_positive, refuse_more_than_fits
 from ssm_decouple.momentum.flow import (
     gauss_points,
     magnus,
@@ -30,7 +30,8 @@ Pace = Callable[[float], float]  # time to the share of the full pace
 Wanted = Callable[[float], Floats | None]  # time to the protected rate that is asked for, None for zero
 
 
-MOST_STEPS = 1e8  # a record of more would not fit into memory
+MOST_STEPS = 1e8  # even without a record
+TIMES_BYTES = 32  # that the sample times take, each
 
 
 class Demand(NamedTuple):
@@ -178,8 +179,13 @@ def between(law: SelectiveLaw, ends: Floats, velocities: Floats, moved: Floats, 
 STEPS: dict[str, Step] = {"explicit": explicit, "held": held, "rk4": runge_kutta}
 
 
-def sample_times(duration: float, dt: float) -> Floats:
+def sample_times(duration: float, dt: float, sample_bytes: int = 0) -> Floats:
     """Return the times of the samples, s; the last step is shorter where `duration` is no multiple of dt.
+
+    Args:
+        duration: s.
+        dt: Time between samples, s.
+        sample_bytes: Memory that a sample takes in the record.
 
     Raises:
         InputError: times that are not positive, or more steps than a record could hold.
@@ -190,6 +196,10 @@ def sample_times(duration: float, dt: float) -> Floats:
         raise InputError(f"dt is {dt:g} s, longer than the duration of {duration:g} s")
     if duration / dt > MOST_STEPS:
         raise InputError(f"{duration:g} s in steps of {dt:g} s are more than {MOST_STEPS:g} steps; take a longer dt")
+    size = duration / dt * (TIMES_BYTES + sample_bytes)
+    refuse_more_than_fits(
+        f"the record of {duration:g} s in steps of {dt:g} s", size, "take a longer dt, or shorter pieces"
+    )
     steps = int(np.ceil(duration / dt * (1 - 1e-12)))
     time = dt * np.arange(steps + 1, dtype=np.float64)
     time[-1] = duration

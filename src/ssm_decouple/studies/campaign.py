@@ -25,6 +25,7 @@ from ssm_decouple.errors import (
     DecoupleWarning,
     FileError,
     InputError,
+    as_count,
     as_function,
     as_kind,
     as_path,
@@ -50,7 +51,9 @@ Rows = dict[str, NDArray[Any]]  # a column's name to its values, a row a sample
 FAILED = "failed"  # the outcome of a sample that could not be computed
 OWN = "case"  # the protection that is the case's own
 CHUNK = 500  # samples, where a campaign does not say
-MOST_SAMPLES = 2**53  # a row number that is a whole number everywhere
+MOST_SAMPLES = 10**10  # rows in all: years of computing
+MOST_ROWS = 10**6  # in a chunk, which is computed and kept as a whole
+MOST_CHUNKS = 10**6  # each a few files
 
 _NAMES = "a list of names, such as ['case1']"
 _SPREAD = "a table of one entry, such as { uniform = .. }"
@@ -609,7 +612,10 @@ def _validate(spec: Mapping[str, Any]) -> None:
         for word in spec["protections"]:
             _protection(word)
     if spec["samples"] * len(spec["cases"]) * len(spec.get("protections", OWN)) > MOST_SAMPLES:
-        raise InputError(f"samples is {spec['samples']}: more rows than can be numbered")
+        raise InputError(f"samples is {spec['samples']}: more than {MOST_SAMPLES:g} rows in all; take fewer")
+    chunk = as_count("chunk", spec.get("chunk", CHUNK), MOST_ROWS)
+    if spec["samples"] > MOST_CHUNKS * chunk:
+        raise InputError(f"samples is {spec['samples']} in chunks of {chunk}: more than {MOST_CHUNKS:,} chunks")
     for table, quantities in _QUANTITIES.items():
         for key, given in spec.get(table, {}).items():
             if key not in quantities:

@@ -17,6 +17,7 @@ from ssm_decouple.control.schedule import Schedule
 from ssm_decouple.errors import DecoupleWarning, InputError, as_kind
 from ssm_decouple.files import written_whole
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.simulation.dynamic import drives_at_limits
 from ssm_decouple.simulation.motion import error_of, robot_of
 from ssm_decouple.simulation.replay import integral_along, rates_along
 from ssm_decouple.simulation.telling import sentences
@@ -58,6 +59,7 @@ class Summary:
             integrator's error, zero in physics.
         saturated: In a dynamic simulation, from when to when, s, a drive stood at its torque limit.
         full_wheels: Which reaction wheels were at full speed, and from when to when, in words.
+        limited_drives: Which drives stood at their torque limits, how long, and what it cost the protection, in words.
         lost: Of a stalled motion the direction that its tasks could move least at the end, and what took it, in words.
         told: What was promised and not kept, in words: see `simulate`.
     """
@@ -85,6 +87,7 @@ class Summary:
     centre_of_mass_drift_m: float
     saturated: tuple[tuple[float, float], ...] = ()
     full_wheels: str = ""
+    limited_drives: str = ""
     lost: str = ""
     told: str = ""
 
@@ -133,6 +136,7 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         centre_of_mass_drift_m=float(np.linalg.norm(drift, axis=1).max()),
         saturated=tuple((start, end) for start, end in json.loads(motion.attrs.get("saturated", "[]"))),
         full_wheels=full_wheels(motion),
+        limited_drives=drives_at_limits(motion),
         lost=lost_direction(motion),
         told="; ".join(sentences(motion)),
     )

@@ -12,12 +12,12 @@ import numpy as np
 
 from ssm_decouple.errors import (
     InputError,
+    as_count,
     as_items,
     as_not_negative,
     as_number,
     as_positive,
     as_seed,
-    as_whole,
 )
 from ssm_decouple.model.perturb import Tolerances, perturbed
 from ssm_decouple.momentum.protection import Protection
@@ -28,6 +28,8 @@ from ssm_decouple.studies.comparison import largest_rotation_deg
 
 LEVELS = (0.01, 0.02, 0.05, 0.1)
 RUNS = 200
+MOST_RUNS = 10**5
+MOST_WORKERS = 1024
 FEEDBACK_GAIN = 1.0  # 1/s
 STEP = 0.02  # s: of the physics, a quarter of the servo's radian
 METRES_PER_LEVEL = 0.1  # what a tolerance of 1 stands for where lengths are concerned: 5 % is 5 mm
@@ -161,9 +163,9 @@ class Robustness(Settled):
         for level in self.levels:
             if not 0 < level < 1:
                 raise InputError(f"level {level} is no tolerance: give shares above 0 and below 1, 0.05 for 5 %")
-        self.runs = as_whole("runs", self.runs, 1, "give at least 1")
+        self.runs = as_count("runs", self.runs, MOST_RUNS, "give at least 1")
         self.feedback_gain = as_positive("feedback_gain", self.feedback_gain, "it must be positive, 1/s")
-        self.workers = as_whole("workers", self.workers, 1, "give at least 1")
+        self.workers = as_count("workers", self.workers, MOST_WORKERS, "give at least 1")
         self.seed = as_seed("seed", self.seed)
         if self.case.protection.k == 0 or np.any(self.case.protection.U_twist[:3]):
             raise InputError(f"case '{self.case.name}' needs a protection of rotation: one to three directions")

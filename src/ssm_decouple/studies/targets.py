@@ -14,7 +14,7 @@ from ssm_decouple.batch import Batch
 from ssm_decouple.batch.results import Motions
 from ssm_decouple.batch.rows import move_poses, place_points
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError, as_floats, as_kind, as_number, as_seed, as_whole
+from ssm_decouple.errors import InputError, as_count, as_floats, as_kind, as_number, as_seed, as_whole
 from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum.protection import AXES, Protection
 from ssm_decouple.settled import Settled, fixed
@@ -24,9 +24,11 @@ from ssm_decouple.studies.postures import MARGIN, PROTECTIONS, joint_ranges
 from ssm_decouple.studies.shares import CONFIDENCE, wilson
 
 Floats = NDArray[np.float64]
+
 Flags = NDArray[np.bool_]
 Triple = tuple[float, float, float]
 
+MOST_TARGETS = 10**6
 COUNT = 10_000
 DRAWN = 8192  # random starts that are looked at together
 TRIES = 64  # so many times before there seem to be none
@@ -576,4 +578,4 @@ def _percentiles(values: Floats, share: float) -> Triple | None:
 
 
 def _check_count(count: int) -> None:
-    as_whole("count of targets", count, 1, "give a whole number from 1")
+    as_count("count of targets", count, MOST_TARGETS, "give a whole number from 1")

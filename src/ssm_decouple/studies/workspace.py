@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc, t
 
 from ssm_decouple.batch.engine import Batch
-from ssm_decouple.errors import InputError, as_floats, as_items, as_positive, as_seed, as_whole
+from ssm_decouple.errors import InputError, as_count, as_floats, as_items, as_positive, as_seed, as_whole
 from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.settled import Settled
@@ -40,6 +40,8 @@ BLOCKS = 16  # independent scrambles
 CHUNK = 2**16  # postures at a time
 CLIMBS = 4  # searched postures to a drawn one
 VOXELS = 2**18  # more are refused: every one keeps a posture for each protection
+MOST_SAMPLES = 10**9  # postures, and four times as many that are searched: weeks
+MOST_POINTS = 2000  # of each joint of a slice
 PER_REACH = 20.0  # voxels to a reach
 CURVE = np.geomspace(1e-6, 10.0, 141)  # m: where the distribution of sigma is counted, 20 to a decade
 
@@ -255,7 +257,8 @@ class Workspace(Settled):
             )
         self.margin = as_positive("margin", self.margin)
         self.seed = as_seed("seed", self.seed)
-        self.samples = as_whole("samples", self.samples, 1, f"give a positive whole number, such as {SAMPLES}")
+        needs = f"give a positive whole number, such as {SAMPLES}"
+        self.samples = as_count("samples", self.samples, MOST_SAMPLES, needs)
         self.protections = tuple(as_items("protections", self.protections, "give a list, such as ['none', 'yaw']"))
         self._ranges = joint_ranges(self.robot)
         self.grid = Grid.about(self.robot, self.voxel)
@@ -440,7 +443,7 @@ def joint_slice(
         InputError: no such joint, or one without a range.
     """
     i, j = (checked_robot(robot).joint_index(name) for name in as_items("joints", joints, "give the names of two"))
-    points = as_whole("points", points, 2)
+    points = as_count("points", as_whole("points", points, 2), MOST_POINTS)
     posture = as_floats("posture", posture)
     if posture.shape != (robot.n_joints,):
         raise InputError(f"posture has shape {posture.shape}; it needs ({robot.n_joints},), a position a joint")
