@@ -66,8 +66,8 @@ def _fold(root: ET.Element) -> tuple[ET.Element, list[_Held], dict[str, str]]:
     below: dict[str, list[ET.Element]] = {}
     for joint in root.findall("joint"):
         below.setdefault(_end(joint, "parent"), []).append(joint)
-    folded, held, names = ET.Element("robot", name=root.get("name", "")), [], {}
-    bodies: dict[str, pin.Inertia] = {}
+    folded, held = ET.Element("robot", name=root.get("name", "")), list[_Held]()
+    names, bodies = dict[str, str](), dict[str, pin.Inertia]()
     # A link, the joint above it, and where that joint's frame stands in the frame of what carries it.
     waiting: list[tuple[str, ET.Element | None, str, pin.SE3]] = [(root_link(root), None, "", pin.SE3.Identity())]
     while waiting:
