@@ -192,3 +192,17 @@ def test_batches_are_those_near_the_origin(ets_vii, rng):
         np.testing.assert_allclose(other.base_rotation, one.base_rotation, atol=1e-9)
         np.testing.assert_allclose(other.configuration[:, :3] - place, one.configuration[:, :3], atol=1e-8)
         assert other.protected_rate.max() < 1e-17
+
+
+def test_a_traced_motion_is_the_one_near_the_origin(ets_vii):
+    jax = pytest.importorskip("jax")
+    from ssm_decouple.batch import JaxBatch
+
+    traced, place = JaxBatch(ets_vii).traced(ssm.SelectiveLaw(ets_vii, ssm.Protection("yaw"))), FAR[0]
+    with jax.enable_x64(True):
+        near = traced.motion(jax.numpy.array(START), jax.numpy.array(TARGET), 5.0, 0.5)
+        pose = jax.numpy.array(np.r_[place, 0.0, 0.0, 0.0, 1.0])
+        far = traced.motion(jax.numpy.array(START), jax.numpy.array(TARGET + place), 5.0, 0.5, pose)
+        np.testing.assert_allclose(far.joints, near.joints, atol=1e-12)
+        np.testing.assert_allclose(np.asarray(far.poses)[:, :3] - place, np.asarray(near.poses)[:, :3], atol=1e-8)
+        assert np.abs(np.asarray(far.command.protected_rate)).max() < 1e-17

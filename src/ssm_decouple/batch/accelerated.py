@@ -280,7 +280,6 @@ class TracedLaw:
         _, (all_joints, poses, told) = jax.lax.scan(step, (columns, place), holds)
         poses = poses.at[:, :3].add(origin)
         told, all_joints, poses = jax.tree.map(lambda x: jax.numpy.moveaxis(x, 0, -1), (told, all_joints, poses))
-        told, all_joints, poses = jax.tree.map(lambda x: jax.numpy.moveaxis(x, 0, -1), (told, all_joints, poses))
         return TracedMotion(_front(all_joints, 1), _front(poses, 1), _traced(told))
 
     def _given(

@@ -589,7 +589,8 @@ def kept(before: tuple[Array, Array], told: Command, pose: Array, time: Array) -
     peak = jnp.maximum(record[rows.PEAK], jnp.max(jnp.abs(rates), axis=0))
     change, own = rates - trail[rows.BEFORE], jnp.maximum(trail[rows.OWN_PEAK], jnp.abs(rates))
     large = jnp.abs(change) > jnp.maximum(rows.REVERSAL_SHARE * own, rows.NOTHING * peak)
-    count = trail[rows.COUNT] + (large & (change * trail[rows.CHANGE] < 0.0))
+    turn = jnp.where(large & (change * trail[rows.CHANGE] < 0.0), 1.0, 0.0)
+    count = trail[rows.COUNT] + turn * trail[rows.TURN]
     record = jnp.concatenate(
         [
             (record[rows.TRAVEL] + time * jnp.sqrt(_square(rates)))[None],
@@ -602,4 +603,4 @@ def kept(before: tuple[Array, Array], told: Command, pose: Array, time: Array) -
             jnp.max(count, axis=0)[None],
         ]
     )
-    return record, jnp.stack([rates, jnp.where(large, change, 0.0), own, count])
+    return record, jnp.stack([rates, jnp.where(large, change, 0.0), turn, own, count])

@@ -30,9 +30,10 @@ RECORD_SIZE = 14
 # What has to be known of the samples before to see that, one entry a joint.
 BEFORE = 0  # the rate at the sample before; not a number at the first
 CHANGE = 1  # its change, if that was large, else zero
-OWN_PEAK = 2  # largest rate of the joint so far
-COUNT = 3  # reversals so far
-TRAIL_SIZE = 4
+TURN = 2  # 1.0 if that was against a large change before it
+OWN_PEAK = 3  # largest rate of the joint so far
+COUNT = 4  # reversals so far
+TRAIL_SIZE = 5
 
 REVERSAL_SHARE = 0.05  # as in simulation/telling.py
 NOTHING = 1e-6  # likewise
@@ -102,12 +103,14 @@ def keep_attitude(pose: Floats, record: Floats) -> None:
 
 @compiled
 def keep_reversals(rates: Floats, trail: Floats, record: Floats) -> None:
-    """Count the joint rates (n,) that reverse: whose change is large and against a large one at the sample before."""
+    """Count the joint rates (n,) that reverse: whose last three changes are large and alternate in sign."""
     for j in range(rates.shape[0]):
         change = rates[j] - trail[BEFORE, j]
         trail[OWN_PEAK, j] = max(trail[OWN_PEAK, j], abs(rates[j]))
         large = abs(change) > max(REVERSAL_SHARE * trail[OWN_PEAK, j], NOTHING * record[PEAK])
-        trail[COUNT, j] += 1.0 if large and change * trail[CHANGE, j] < 0.0 else 0.0
+        turn = 1.0 if large and change * trail[CHANGE, j] < 0.0 else 0.0
+        trail[COUNT, j] += turn * trail[TURN, j]
+        trail[TURN, j] = turn
         trail[CHANGE, j] = change if large else 0.0
         trail[BEFORE, j] = rates[j]
         record[REVERSALS] = max(record[REVERSALS], trail[COUNT, j])

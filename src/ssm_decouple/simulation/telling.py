@@ -18,8 +18,8 @@ from ssm_decouple.simulation.motion import flagged_spans
 
 Floats = NDArray[np.float64]
 
-# A rate reverses where its change from sample to sample does, both changes being above this share of the joint's
-# largest rate so far: no smooth motion has that twice running.
+# A rate reverses from sample to sample where three changes running alternate in sign, each above this share of the
+# joint's largest rate so far: no smooth motion has that.
 REVERSAL_SHARE = 0.05
 NOTHING = 1e-6  # of the largest rate of any joint so far: less is rounding
 REVERSALS = 10  # of a joint, from which on they are told
@@ -30,7 +30,7 @@ TORQUE_SHARE = 1.01  # of a motor's torque: an acceleration limit of the wheel l
 
 
 def reversals(joint_rates: Floats) -> NDArray[np.bool_]:
-    """Say at which samples which joint's rate reverses, to one side and back in two steps (m, n).
+    """Say at which samples which joint's rate reverses once more: there, back and there again in three steps (m, n).
 
     Args:
         joint_rates: Commanded rates (m, n), rad/s or m/s.
@@ -38,7 +38,8 @@ def reversals(joint_rates: Floats) -> NDArray[np.bool_]:
     found = np.zeros(joint_rates.shape, dtype=bool)
     changes, peaks = np.diff(joint_rates, axis=0), np.maximum.accumulate(np.abs(joint_rates))[1:]
     large = np.abs(changes) > np.maximum(REVERSAL_SHARE * peaks, NOTHING * peaks.max(axis=1, keepdims=True))
-    found[1:-1] = large[1:] & large[:-1] & (changes[1:] * changes[:-1] < 0.0)
+    turns = large[1:] & large[:-1] & (changes[1:] * changes[:-1] < 0.0)
+    found[3:] = turns[1:] & turns[:-1]
     return found
 
 
