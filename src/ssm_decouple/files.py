@@ -45,6 +45,8 @@ def written_whole(path: str | Path) -> Iterator[Path]:
         FileError: the place cannot be written, or is no place for a file.
     """
     final, temporary = Path(path), None
+    if "\0" in str(final):
+        raise FileError(f"cannot write {str(final)!r}: no file can be called so")
     try:
         if final.exists():
             _refuse_unfit(final)

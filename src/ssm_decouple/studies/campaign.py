@@ -39,6 +39,8 @@ FAILED = "failed"  # the outcome of a sample that could not be computed
 OWN = "case"  # the protection that is the case's own
 CHUNK = 500  # samples, where a campaign does not say
 MOST_SAMPLES = 2**53  # a row number that is a whole number everywhere
+MOST_IN_CHUNK = 10**6  # samples, which take a gigabyte while they are computed
+MOST_CHUNKS = 10**8  # which take some bytes each, and files by the dozen
 
 _NAMES = "a list of names, such as ['case1']"
 _SPREAD = "a table of one entry, such as { uniform = .. }"
@@ -160,7 +162,7 @@ class Campaign:
             spec = tomllib.loads(text)
         except OSError as error:
             raise InputError(f"cannot read the campaign '{path}': {error.strerror or error}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:  # not UTF-8, a number of thousands of digits, tables without end
             raise InputError(f"'{path}' is not TOML: {error}") from error
         try:
             _validate(spec)
@@ -588,13 +590,19 @@ def _validate(spec: Mapping[str, Any]) -> None:
     for key in spec.keys() & {"samples", "chunk"}:
         if not (isinstance(spec[key], int) and spec[key] > 0):
             raise InputError(f"{key} is {spec[key]!r}; it must be a whole number above 0")
+    chunk = spec.get("chunk", CHUNK)
+    if chunk > MOST_IN_CHUNK:
+        raise InputError(f"chunk is {chunk}; a chunk is computed in memory, and holds {MOST_IN_CHUNK} samples at most")
     _check_names(spec, "cases")
     if "protections" in spec:
         _check_names(spec, "protections")
         for word in spec["protections"]:
             _protection(word)
-    if spec["samples"] * len(spec["cases"]) * len(spec.get("protections", OWN)) > MOST_SAMPLES:
+    rows = spec["samples"] * len(spec["cases"]) * len(spec.get("protections", (OWN,)))
+    if rows > MOST_SAMPLES:
         raise InputError(f"samples is {spec['samples']}: more rows than can be numbered")
+    if rows > MOST_CHUNKS * chunk:
+        raise InputError(f"samples is {spec['samples']}: {rows // chunk} chunks; give a chunk more than {chunk}")
     for table, quantities in _QUANTITIES.items():
         for key, given in spec.get(table, {}).items():
             if key not in quantities:
