@@ -55,6 +55,8 @@ def written_whole(path: str | Path) -> Iterator[Path]:
     final, temporary = Path(path), None
     if not final.name:
         raise FileError(f"cannot write '{final}': it names no file")
+    if "\0" in str(final):
+        raise FileError(f"cannot write {str(final)!r}: no file can be called so")
     try:
         if final.exists():
             _refuse_unfit(final)

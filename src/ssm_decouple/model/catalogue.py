@@ -122,7 +122,7 @@ def describe(source: str | Path) -> Description:
         return Description(path.stem, path)
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # not UTF-8, a number of thousands of digits, tables without end
         raise ModelError(f"'{path}' is not TOML: {error}") from error
     except OSError as error:
         raise ModelError(f"cannot read '{path}': {error.strerror or error}") from error

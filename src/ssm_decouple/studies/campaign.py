@@ -52,7 +52,7 @@ FAILED = "failed"  # the outcome of a sample that could not be computed
 OWN = "case"  # the protection that is the case's own
 CHUNK = 500  # samples, where a campaign does not say
 MOST_SAMPLES = 10**10  # rows in all: years of computing
-MOST_ROWS = 10**6  # in a chunk, which is computed and kept as a whole
+MOST_IN_CHUNK = 10**6  # samples, which take a gigabyte while they are computed
 MOST_CHUNKS = 10**6  # each a few files
 
 _NAMES = "a list of names, such as ['case1']"
@@ -176,7 +176,7 @@ class Campaign(Settled):
             spec = tomllib.loads(text)
         except OSError as error:
             raise InputError(f"cannot read the campaign '{path}': {error.strerror or error}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:  # not UTF-8, a number of thousands of digits, tables without end
             raise InputError(f"'{path}' is not TOML: {error}") from error
         try:
             _validate(spec)
@@ -606,16 +606,19 @@ def _validate(spec: Mapping[str, Any]) -> None:
     for key in spec.keys() & {"samples", "chunk"}:
         if not (isinstance(spec[key], int) and spec[key] > 0):
             raise InputError(f"{key} is {spec[key]!r}; it must be a whole number above 0")
+    chunk = spec.get("chunk", CHUNK)
+    if chunk > MOST_IN_CHUNK:
+        raise InputError(f"chunk is {chunk}; a chunk is computed in memory, and holds {MOST_IN_CHUNK} samples at most")
     _check_names(spec, "cases")
     if "protections" in spec:
         _check_names(spec, "protections")
         for word in spec["protections"]:
             _protection(word)
-    if spec["samples"] * len(spec["cases"]) * len(spec.get("protections", OWN)) > MOST_SAMPLES:
+    rows = spec["samples"] * len(spec["cases"]) * len(spec.get("protections", (OWN,)))
+    if rows > MOST_SAMPLES:
         raise InputError(f"samples is {spec['samples']}: more than {MOST_SAMPLES:g} rows in all; take fewer")
-    chunk = as_count("chunk", spec.get("chunk", CHUNK), MOST_ROWS)
-    if spec["samples"] > MOST_CHUNKS * chunk:
-        raise InputError(f"samples is {spec['samples']} in chunks of {chunk}: more than {MOST_CHUNKS:,} chunks")
+    if rows > MOST_CHUNKS * chunk:
+        raise InputError(f"samples is {spec['samples']}: {rows // chunk} chunks; give a chunk more than {chunk}")
     for table, quantities in _QUANTITIES.items():
         for key, given in spec.get(table, {}).items():
             if key not in quantities:

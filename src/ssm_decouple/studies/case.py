@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -60,6 +59,7 @@ from ssm_decouple.studies.schema import (
     TEXT,
     TURNS,
     check_keys,
+    read_toml,
 )
 
 if TYPE_CHECKING:
@@ -300,10 +300,7 @@ def load_case(source: str | Path) -> Case:
     path = catalogue.get(str(source), path)
     if not is_file(path):
         raise InputError(f"'{source}' is neither a file nor one of the cases {', '.join(catalogue)}")
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"'{path}' is not TOML: {error}") from error
+    content, _ = read_toml(path)
     try:
         return case_of(content, path)
     except DecoupleError as error:
@@ -396,9 +393,11 @@ def _tasks(content: Mapping[str, Any]) -> tuple[list[Task], Any]:
     return tasks, targets[0] if len(targets) == 1 else targets
 
 
-def _task(table: Mapping[str, Any], place: str) -> tuple[Task, Any]:
+def _task(table: Any, place: str) -> tuple[Task, Any]:
+    if not isinstance(table, dict):
+        raise InputError(f"{place}is {table!r}; it must be a table")
     kind = table.get("kind")
-    if kind not in _TASKS:
+    if not isinstance(kind, str) or kind not in _TASKS:
         raise InputError(f"{place}{unknown('kind', str(kind), list(_TASKS))}")
     made, keys = _TASKS[kind]
     check_keys(table, {**_ANY_TASK, **keys}, place)
@@ -467,6 +466,8 @@ def _validate(content: dict[str, Any]) -> None:
     for table, keys in _SCHEMA.items():
         values = content.get(table, {}) if table else {k: v for k, v in content.items() if k not in tables}
         check_keys(values, keys, f"[{table}] " if table else "")
+    if "protection" not in content:
+        raise InputError("[protection] is missing; it needs axes")
     for number, phase in enumerate(content["protection"].get("phases", []), 1):
         check_keys(phase, {"from": (NUMBER, True), "axes": (AXES, True)}, f"[protection] phase {number} ")
     method = content["simulation"].get("method", "explicit")
