@@ -47,6 +47,8 @@ centroidal_map, selective_command, array = pin.computeCentroidalMap, kernel.sele
 
 FASTEST = 2 * np.pi  # rad/s: above it a joint's rate limit looks like degrees
 
+FULL = 1.0  # the pace of a command that is asked for nothing else
+
 CLIMB_STEP = 1e-6  # rad or m, of the finite differences
 CLIMB_SHARE = 0.25  # of the rate limits
 
@@ -517,7 +519,8 @@ class SelectiveLaw(Settled):
         constants = (U_c, layout.table.copy(), columns, parameters)
         self._prepared = (model, data, views, constants, (*views, *constants))
         self._reads_joints = bool(np.any(layout.table[:, kernel.KIND] == kernel.JOINTS))
-        self._flat = layout.plain
+        self._flat, self._climbs = layout.plain, layout.climbs
+        self._quick = not self._reads_joints  # and no limits
         self._at_rest: Floats = np.zeros(layout.target_sizes[1])  # writable, as the kernel wants it; never written
         self._n, self._k = n, self.protection.k
         self._no_rates: Floats = np.zeros(n)
@@ -539,6 +542,7 @@ class SelectiveLaw(Settled):
         layout, scale = self.layout, 1.0 / np.sqrt(self.joint_weights)
         _, _, _, (_, _, columns, parameters), _ = self._prepared
         columns[kernel.RATE_LIMIT], parameters[kernel.LIMITS_STEPS] = np.inf, 0.0
+        self._quick = False
         accelerations = self.acceleration_limits
         self._step = LimitedStep(
             self.robot,
@@ -576,7 +580,7 @@ class SelectiveLaw(Settled):
         target_velocity: Any = None,
         previous_rates: ArrayLike | None = None,
         protected_rate: ArrayLike | None = None,
-        pace: float = 1.0,
+        pace: float = FULL,
         time: float = 0.0,
     ) -> Command:
         """Return the command at a configuration.
@@ -623,7 +627,7 @@ class SelectiveLaw(Settled):
         out: Floats,
         previous_rates: ArrayLike | None = None,
         protected_rate: ArrayLike | None = None,
-        pace: float = 1.0,
+        pace: float = FULL,
         time: float = 0.0,
     ) -> None:
         """Compute a command into an array: the same as calling the law, without the result object.
@@ -642,7 +646,7 @@ class SelectiveLaw(Settled):
         Raises:
             InputError: as for the call.
         """
-        if protected_rate is not None or type(pace) is not float or pace != 1.0:
+        if protected_rate is not None or not (pace is FULL or (type(pace) is float and pace == 1.0)):
             _, _, _, (*_, parameters), _ = self._prepared
             usual = parameters.copy()
             parameters[kernel.PACE : kernel.MOMENTUM] = self._asked(protected_rate, pace)
@@ -655,35 +659,31 @@ class SelectiveLaw(Settled):
             if self.acceleration_limits is not None:
                 raise InputError("an acceleration limit needs previous_rates: those commanded before, zeros from rest")
             previous_rates = self._no_rates
-        if self.layout.climbs is not None:
-            place, gain = self.layout.climbs
+        elif type(previous_rates) is not array:
+            previous_rates = self._checked_rates(previous_rates)
+        if self._climbs is not None:
+            place, gain = self._climbs
             velocities = self._flat_vectors(target, target_velocity)[1].copy()
             velocities[place] = self._rates_that_climb(q, gain)
             target_velocity = velocities
-        model, data, _, constants, fixed = self._prepared
+        model, data, _, _, fixed = self._prepared
         try:  # arrays of the right kind are not looked at twice
-            if not (type(q) is type(target) is type(target_velocity) is type(previous_rates) is array):
+            if not (type(q) is type(target) is type(target_velocity) is array):
                 raise TypeError  # a subclass: a masked array would pass as what lies under its mask
             centroidal_map(model, data, q)
-            if self._reads_joints:
-                kernel.read_joints(q, constants[2])
-            status = (  # a q that Pinocchio reads in its own way, such as one of another byte order, does not fit here
+            # A q that Pinocchio reads in its own way, such as one of another byte order, does not fit here.
+            status = (
                 selective_command(*fixed, target, target_velocity, previous_rates, out, q)
-                if self._step is None
-                else self._limited_command(q, target, target_velocity, previous_rates, out)
+                if self._quick
+                else self._other_command(q, target, target_velocity, previous_rates, out)
             )
         except (TypeError, ValueError):  # a list, another layout, a read-only array or a wrong length
             q = self.robot.checked(q)
             target, target_velocity = self._flat_vectors(target, target_velocity)
             previous_rates = self._checked_rates(previous_rates)
             pin.computeCentroidalMap(model, data, q)
-            kernel.read_joints(q, constants[2])
             out = self._checked_out(out)
-            status = (
-                kernel.selective_command(*fixed, target, target_velocity, previous_rates, out, q)
-                if self._step is None
-                else self._limited_command(q, target, target_velocity, previous_rates, out)
-            )
+            status = self._other_command(q, target, target_velocity, previous_rates, out)
         if self.hold_nodes and status == kernel.OK:
             status = self._hold(q, np.asarray(target), np.asarray(target_velocity), np.asarray(previous_rates), out)
         if status == kernel.FAR_AWAY:
@@ -701,6 +701,15 @@ class SelectiveLaw(Settled):
         targets, velocities = self._flat_vectors(target, target_velocity)
         self.evaluate(near, self.layout.targets_from(origin, targets), velocities, out, previous)
         out[6 + self._n + kernel.POSITION :][:3] += origin
+    def _other_command(
+        self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, previous: ArrayLike, out: Floats
+    ) -> int:
+        """Do what `selective_command` does for a law that reads joint positions or brings its rates inside limits."""
+        if self._step is not None:
+            return self._limited_command(q, target, target_velocity, previous, out)
+        _, _, _, (_, _, columns, _), fixed = self._prepared
+        kernel.read_joints(q, columns)  # type: ignore[arg-type]
+        return selective_command(*fixed, target, target_velocity, previous, out, q)  # type: ignore[arg-type]
 
     def _limited_command(
         self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, previous: ArrayLike, out: Floats

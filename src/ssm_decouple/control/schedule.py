@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.control.law import LostDirection, SelectiveLaw
+from ssm_decouple.control.law import FULL, LostDirection, SelectiveLaw
 from ssm_decouple.control.task import RateTask
 from ssm_decouple.errors import InputError, as_floats, as_items, as_kind, as_number, as_positive, shown
 from ssm_decouple.model.robot import Robot
@@ -274,7 +274,7 @@ class ScheduledLaw(SelectiveLaw):
         out: Floats,
         previous_rates: ArrayLike | None = None,
         protected_rate: ArrayLike | None = None,
-        pace: float = 1.0,
+        pace: float = FULL,
         time: float = 0.0,
     ) -> None:
         """Compute a command into an array, as `SelectiveLaw.evaluate` does; the call does the same.
