@@ -84,11 +84,8 @@ def test_no_input_of_the_live_page_stops_its_clock(live, visit, capfd):
     visitor = visit(live)
     inputs = [handle for handle in live.server.gui._gui_input_handle_from_uuid.values() if not handle._impl.is_button]
     assert len(inputs) == 3  # the protection, the own axes, the speed
-    own = next(
-        h
-        for h in live.server.gui._gui_input_handle_from_uuid.values()
-        if h._impl.is_button and h.label == "protect own axes"
-    )
+    buttons = [handle for handle in live.server.gui._gui_input_handle_from_uuid.values() if handle._impl.is_button]
+    own = next(button for button in buttons if button.label == "protect own axes")
     for number in NOWHERE[:2]:
         visitor.look(number)
     visitor.look(pixels=0)
@@ -206,13 +203,13 @@ def test_targets_and_orientations_that_are_none_are_refused_at_the_door():
     with Live(case, port=0) as live:
         before = live.target.copy()
         for wrong in ([np.nan, 0, 0], [0, np.inf, 0], [0, 0], "here", None, [[0, 0, 0]]):
-            with pytest.raises(ssm.InputError, match="position of the target .* needs 3 finite numbers"):
+            with pytest.raises(ssm.InputError, match=r"position of the target .* needs 3 finite numbers"):
                 live.drag(wrong)
         np.testing.assert_array_equal(live.target, before)
         live.posed, live.target = True, pin.SE3(np.eye(3), before)  # as with a pose to reach
         live._over.set()
         for wrong in ([np.nan] * 4, [1, 0, 0], [np.inf, 0, 0, 0]):
-            with pytest.raises(ssm.InputError, match="orientation of the target .* needs 4 finite numbers"):
+            with pytest.raises(ssm.InputError, match=r"orientation of the target .* needs 4 finite numbers"):
                 live.drag(before, wrong)
         with pytest.raises(ssm.InputError, match="a quaternion w x y z is no zero"):
             live.drag(before, [0, 0, 0, 0])

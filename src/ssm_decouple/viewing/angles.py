@@ -30,7 +30,7 @@ def joint_kinds(motion: xr.Dataset) -> list[str]:
 
 
 def unwrapped(angles: Floats) -> Floats:
-    """Return angles (m, ..), rad, without jumps of a turn from one to the next; those after a gap are left as they are."""
+    """Return angles (m, ..), rad, without jumps of a turn from one to the next; what is no number stays so."""
     found = angles.copy()
     there = np.isfinite(angles).reshape(len(angles), -1).all(axis=1)
     found[there] = np.unwrap(angles[there], axis=0)

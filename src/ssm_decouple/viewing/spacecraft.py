@@ -86,7 +86,8 @@ def draw_configurations(motion: xr.Dataset) -> Figure:
     azimuth = max(_AZIMUTHS, key=lambda angle: _arm_share(seen[0], angle))
     shown = [_shown(motion, sight, sample, azimuth) for sight, sample in zip(seen, samples, strict=True)]
     frames = [np.array([points.min(axis=0), points.max(axis=0)]) for points in shown]
-    figure = Figure(figsize=(PAGE, _HEIGHT), layout="none")
+    figure = Figure(figsize=(PAGE, _HEIGHT))
+    figure.set_layout_engine("none")
     for i, (sample, sight, frame) in enumerate(zip(samples, seen, frames, strict=True)):
         axes = figure.add_subplot(1, 2, i + 1, projection="3d", computed_zorder=False)
         _draw_spacecraft(axes, sight)
@@ -117,7 +118,7 @@ def _samples(motion: xr.Dataset) -> tuple[int, int]:
 
 
 def _parts(robot: Robot, motion: xr.Dataset) -> tuple[list[Part], str]:
-    """Return the shapes, those of appendages that the URDF draws none of too, and a word on meshes that are not here."""
+    """Return the shapes, with those of appendages that the URDF does not draw, and what is to be said of them."""
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always", DecoupleWarning)
         parts = spacecraft_parts(robot, json.loads(motion.attrs.get("turned", "{}")))
@@ -162,9 +163,10 @@ def _arms(robot: Robot, data: pin.Data, wheel_names: Sequence[str]) -> list[Floa
     for joint in range(2, model.njoints):
         if joint in wheels or len(model.subtrees[joint]) > 1 or joint in model.supports[tool.parentJoint]:
             continue
-        held = [data.oMf[i].translation for i, frame in enumerate(model.frames) if frame.parentJoint == joint]
         root = data.oMi[joint].translation
-        arms.append(chain(joint, max(held, key=lambda tip, root=root: float(np.linalg.norm(tip - root)), default=root)))
+        held = [data.oMf[i].translation for i, frame in enumerate(model.frames) if frame.parentJoint == joint]
+        farthest = int(np.argmax([np.linalg.norm(tip - root) for tip in held]))
+        arms.append(chain(joint, held[farthest]))
     return arms
 
 
@@ -182,7 +184,7 @@ def _axis(pose: pin.SE3, box: Floats, size: float, direction: Floats) -> Floats:
 
 
 def _shown(motion: xr.Dataset, sight: _Sight, sample: int, azimuth: float) -> Floats:
-    """Return points (.., 3), m, whose box is what a panel shows: spacecraft, path and target as far as they are near."""
+    """Return points (.., 3), m, whose box a panel shows: the spacecraft, and what is near of path and target."""
     body = sight.body
     low, high = body.min(axis=0) - _BESIDE * sight.size, body.max(axis=0) + _BESIDE * sight.size
     beside = np.vstack([motion.end_effector_position.values, motion.target_position.values[sample]])
@@ -254,6 +256,7 @@ def _set_view(axes: Axes3D, frame: Floats, azimuth: float) -> None:
     axes.set_box_aspect(np.ptp(frame, axis=0))
     axes.view_init(elev=_ELEVATION, azim=azimuth)
     axes.set_axis_off()
+    axes.patch.set_visible(False)  # the squares of the two panels lie over each other
 
 
 def _fill(figure: Figure, shown: Sequence[Floats]) -> None:
@@ -282,7 +285,7 @@ def _fill(figure: Figure, shown: Sequence[Floats]) -> None:
 
 
 def _faces(shape: Shape | Part, tile: float = 0.8) -> list[Floats]:
-    """Return the faces of a shape in its own axes, m, outsides out; boxes are cut into tiles, of meshes it is the hull."""
+    """Return the faces of a shape in its own axes, m, outsides out: a box is cut into tiles, a mesh has its hull's."""
     if shape.kind == "box":
         return _box_faces(np.array(shape.size), tile)
     if shape.kind == "cylinder":

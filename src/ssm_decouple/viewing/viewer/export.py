@@ -265,9 +265,10 @@ def _captioned(
         y = round(3 * unit + (i + 0.5) * room - 3.6 * unit)
         draw.rectangle((unit, y + 0.15 * unit, 1.7 * unit, y + 0.85 * unit), color)
         draw.text((2.2 * unit, y), scene.name, ink, bold)
+        of_left = " mm" if scene.distance_unit == "mm" else ""  # others stand with the number
         lines = [
             status(scene, now),
-            f"left {left}{' mm' * (scene.distance_unit == 'mm')}",
+            f"left {left}{of_left}",
             f"turned {turned} deg",
             f"|w_sub| {protected} rad/s",
         ]

@@ -108,9 +108,7 @@ class Player(Page):
         assert self.bending is not None
         power = self.bending.value
         if not self.bending.min <= power <= self.bending.max:
-            raise InputError(
-                f"bending is 10^{power:g}; the slider goes from {self.bending.min:g} to {self.bending.max:g}"
-            )
+            raise InputError(f"bending is 10^{power:g}; its slider goes to {self.bending.max:g}")
         self.exaggeration = float(f"{10.0**power:.2g}")
         self.bending.label = f"bending x {self.exaggeration:g}"
         self._wake.set()
@@ -209,7 +207,7 @@ class Player(Page):
 
 
 def numbers(scene: Scene, now: float) -> tuple[str, str, str, str]:
-    """Return distance to the target (mm, else with its unit), rotation of the base (deg), protected rate and momentum in words."""
+    """Return in words distance to the target (mm, or with its unit), rotation (deg), protected rate and momentum."""
     i = int(np.clip(np.searchsorted(scene.time, now, side="right") - 1, 0, len(scene.time) - 1))
     left = float(scene.distance_shown[i])
     protected = "-" if scene.protected_rate is None else f"{scene.protected_rate[i]:.0e}"

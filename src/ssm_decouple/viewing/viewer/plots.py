@@ -99,11 +99,12 @@ def curves_of(scenes: Sequence[Scene], chosen: int) -> list[Curves]:
     own, everywhere = joint_kinds(motion), {kind for s in scenes for kind in joint_kinds(s.motion)}
     for kind in [kind for kind in JOINT_UNITS if kind in everywhere]:
         name, unit, factor = JOINT_UNITS[kind]
+        rates = factor * motion.joint_rates.values
         lines = tuple(
             (
                 label.replace("joint_", ""),
                 shades[i],
-                np.interp(time, scene.time, factor * motion.joint_rates.values[:, i]),
+                np.interp(time, scene.time, rates[:, i]),
             )
             for i, label in enumerate(map(str, motion.joint.values))
             if own[i] == kind

@@ -355,8 +355,8 @@ def _checked_robot(name: str, motion: xr.Dataset) -> Robot:
     lost = int(np.sum(~np.isfinite(motion.configuration.values).all(axis=1)))
     if lost:
         raise InputError(
-            f"motion '{name}' has {lost} of {motion.sizes['time']} samples whose configuration is not finite; show those "
-            "before them alone: motion.isel(time=slice(0, ..))"
+            f"motion '{name}' has {lost} of {motion.sizes['time']} samples whose configuration is not finite; show "
+            "those before them: motion.isel(time=slice(0, ..))"
         )
     if tuple(motion.joint.values) != robot.joint_names:
         raise InputError(
