@@ -189,11 +189,9 @@ def test_port_80_need_not_be_said():
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "::1", "localhost"])
 def test_other_addresses_to_listen_on_have_their_names(host):
-    try:
-        server = open_server(host, 0)
-    except ssm.InputError as error:
-        assert "cannot listen" in str(error)
-        pytest.skip(f"this machine has no {host}")
+    if ":" in host and not socket.has_ipv6:
+        pytest.skip("this machine has no IPv6")
+    server = open_server(host, 0)
     try:
         port, ours = server.get_port(), socket.gethostname()
         own, address = host in ("::1", "localhost"), "::1" if ":" in host else "127.0.0.1"
@@ -246,7 +244,7 @@ def test_a_viser_that_opens_its_server_otherwise_is_not_opened(monkeypatch):
     monkeypatch.setattr(viser, "ViserServer", making)
     with pytest.raises(ssm.InputError, match=r"viser \d.* any web page could use it: it is not opened"):
         open_server(port=0)
-    with pytest.raises(OSError):
+    with pytest.raises(ConnectionRefusedError):
         socket.create_connection(("127.0.0.1", opened[0].get_port()), timeout=2.0)
 
 

@@ -265,7 +265,13 @@ def _captioned(
         y = round(3 * unit + (i + 0.5) * room - 3.6 * unit)
         draw.rectangle((unit, y + 0.15 * unit, 1.7 * unit, y + 0.85 * unit), color)
         draw.text((2.2 * unit, y), scene.name, ink, bold)
-        lines = [status(scene, now), f"left {left} mm", f"turned {turned} deg", f"|w_sub| {protected} rad/s"]
+        of_left = " mm" if scene.distance_unit == "mm" else ""  # others stand with the number
+        lines = [
+            status(scene, now),
+            f"left {left}{of_left}",
+            f"turned {turned} deg",
+            f"|w_sub| {protected} rad/s",
+        ]
         if scene.protected_rate is None:
             lines[-1] = "nothing protected"
         lines.append(f"momentum {momentum}" + (" N m s" if scene.has_momentum else ""))

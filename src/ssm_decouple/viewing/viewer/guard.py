@@ -1,8 +1,8 @@
 """Who may use a page: those who ask for it at an address of this machine, and no page of anybody else.
 
-A browser lets any web page connect to any address, and a name of its own may be made to mean 127.0.0.1 (DNS rebinding).
-It says truly, though, what it was asked for (Host) and by whose page (Origin), so both are checked, for files and for the
-connection that drives the page alike. A program that is no browser sends no Origin; it needs none.
+A browser lets any web page connect to any address, and a name of its own may be made to mean 127.0.0.1 (DNS
+rebinding). It says truly, though, what it was asked for (Host) and by whose page (Origin), so both are checked, for
+files and for the connection that drives the page alike. A program that is no browser sends no Origin; it needs none.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ PATIENCE = 10.0  # s
 _PLACE = re.compile(r"(\[[0-9a-f:.]*:[0-9a-f:.]*\]|[a-z0-9._-]+)(?::([0-9]{1,5}))?", re.ASCII | re.IGNORECASE)
 _OPENING = threading.Lock()
 
-Answer = Callable[["ServerConnection", "Request"], "Response | None | Awaitable[Response | None]"]
+Answer = Callable[["ServerConnection", "Request"], "Response | Awaitable[Response | None] | None"]
 
 
 def names_of(host: str) -> frozenset[str]:
@@ -64,7 +64,7 @@ def refusal(headers: Headers, names: frozenset[str], address: str, port: int) ->
 def guarded(host: str) -> Iterator[None]:
     """Have the server that viser opens on `host` meanwhile refuse what is not asked for at this machine's addresses.
 
-    viser has no setting for it, but passes websockets' `serve` a function that sees every request before it is answered.
+    viser has no setting for it, but gives websockets' `serve` a function that sees every request before it is answered.
     """
     import websockets.asyncio.server as websockets_server
 

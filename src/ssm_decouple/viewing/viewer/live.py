@@ -28,6 +28,8 @@ from ssm_decouple.studies.case import Case, cases, load_case
 from ssm_decouple.viewing.viewer.page import Page, chosen_pace, one_of
 from ssm_decouple.viewing.viewer.parts import Part, antenna, drawn_reach, spacecraft_parts
 from ssm_decouple.viewing.viewer.plots import AXES, FLOOR, HEIGHT, POINTS, caption
+from ssm_decouple.viewing.viewer.parts import Part, antenna, spacecraft_parts
+from ssm_decouple.viewing.viewer.plots import AXES, FLOOR, FLOORED, HEIGHT, POINTS, caption
 from ssm_decouple.viewing.viewer.scene import Vectors, body_poses, rotated, split_rate
 from ssm_decouple.viewing.viewer.server import HOST, PORT
 from ssm_decouple.viewing.viewer.shapes import (
@@ -53,7 +55,9 @@ TRAIL = 300
 USUAL = 0.2  # of the base rate that one joint causes at its limit: the longest arrow, until there has been more
 QUIET = 1e-7  # rad/s: slower joints are at rest on a page
 FOLLOWED = 60.0  # s: what the plots show
-_PLOTS = (("left (mm), the last minute", "#56B4E9"), ("|w_sub| (10^x rad/s), the last minute", "#CC79A7"))
+FARTHEST = 1e9  # m: no target is dragged farther
+FASTEST = 1e9  # m/s, rad/s: what is faster, or no number, is no motion
+_PLOTS = (("left (mm), the last minute", "#56B4E9"), (f"|w_sub| (10^x rad/s{FLOORED}), the last minute", "#CC79A7"))
 
 
 @dataclass
@@ -140,9 +144,11 @@ class Live(Page):
             wxyz: Orientation (4,), where the case asks for one.
 
         Raises:
-            InputError: they are not finite numbers, or the orientation is none; the target stays where it is.
+            InputError: they are not finite numbers, too far, or the orientation is none; the target stays where it is.
         """
         place = _finite("position of the target", position, 3)
+        if np.abs(place).max() > FARTHEST:
+            raise InputError(f"the target is {np.abs(place).max():.3g} m away; {FARTHEST:g} m is the farthest")
         turn = None
         if self.posed and wxyz is not None:
             given = _finite("orientation of the target", wxyz, 4)
@@ -295,11 +301,7 @@ class Live(Page):
         model, dt = self.robot.model, self.case.dt
         while left > 1e-12:
             h = min(left, dt - self.held)
-            moved = pin.integrate(model, self.q, h * self.values[: model.nv])
-            if not np.all(np.isfinite(moved)):
-                self.values, self._in_vain = np.zeros(self.law.size), True
-                raise InputError("the law's joint rates lead to no configuration; bring the target nearer")
-            self.q = moved
+            self.q = pin.integrate(model, self.q, h * self.values[: model.nv])
             self.clock, self.held, left = self.clock + h, self.held + h, left - h
             if self.held >= dt - 1e-12:
                 self._ask()
@@ -308,7 +310,7 @@ class Live(Page):
         """Ask the law and remember what it says; while it cannot be asked the arm stands still.
 
         Raises:
-            InputError: its joint rates are not numbers.
+            InputError: its joint rates are no motion.
             Exception: what the law raises.
         """
         law, n = self.law, self.robot.n_joints
@@ -316,7 +318,7 @@ class Live(Page):
         previous, said = self.values[6 : 6 + n].copy(), np.zeros(law.size)
         self.values, self._in_vain, self.held = np.zeros(law.size), True, 0.0
         law.evaluate(self.q, target, law.layout.flat_velocities(None), said, previous, time=self.clock)
-        if not np.all(np.isfinite(said[: 6 + n])):
+        if not np.all(np.abs(said[: 6 + n]) < FASTEST):
             raise InputError("the law has no joint rates for this target; move it, or go back to the start")
         self.values, self._in_vain = said, False
         results = self.values[6 + n :]

@@ -108,9 +108,7 @@ class Player(Page):
         assert self.bending is not None
         power = self.bending.value
         if not self.bending.min <= power <= self.bending.max:
-            raise InputError(
-                f"bending is 10^{power:g}; the slider goes from {self.bending.min:g} to {self.bending.max:g}"
-            )
+            raise InputError(f"bending is 10^{power:g}; its slider goes to {self.bending.max:g}")
         self.exaggeration = float(f"{10.0**power:.2g}")
         self.bending.label = f"bending x {self.exaggeration:g}"
         self._wake.set()
@@ -209,12 +207,13 @@ class Player(Page):
 
 
 def numbers(scene: Scene, now: float) -> tuple[str, str, str, str]:
-    """Return distance to the target (mm), rotation of the base (deg), protected rate and momentum in words."""
+    """Return in words distance to the target (mm, or with its unit), rotation (deg), protected rate and momentum."""
     i = int(np.clip(np.searchsorted(scene.time, now, side="right") - 1, 0, len(scene.time) - 1))
-    left = 1e3 * scene.distance[i]
+    left = float(scene.distance_shown[i])
     protected = "-" if scene.protected_rate is None else f"{scene.protected_rate[i]:.0e}"
     momentum = f"{np.linalg.norm(scene.angular_momentum[i]):.3g}" if scene.has_momentum else "zero"
-    return f"{left:.1f}" if np.isfinite(left) else "-", f"{scene.turned_deg[i]:.3f}", protected, momentum
+    told = f"{left:.1f}" if scene.distance_unit == "mm" else f"{left:.2g} {scene.distance_unit}"
+    return told if np.isfinite(left) else "-", f"{scene.turned_deg[i]:.3f}", protected, momentum
 
 
 def status(scene: Scene, now: float) -> str:
