@@ -45,7 +45,7 @@ COARSEST = 0.5
 # Steps times the squared number of velocities that one compiled call does: some 0.2 s.
 STEP_WORK = 2_000_000
 # Of the servo's own time, 1 / (2 pi frequency), at most: so long a piece of a joint's path is a cubic to 1e-8 rad.
-PIECE = 1.5
+PIECE = 0.8
 MOST_STEPS = 1e8  # of physics in a motion: some twenty minutes of a six-joint arm
 NEXT_TO_NOTHING = 1e-8  # rad or m, of a protected direction: two thousandths of an arcsecond
 TINY = 1e-300  # keeps a share of nothing from being NaN

@@ -638,6 +638,16 @@ def base_twist_of(parent: Ints, tree: Floats, q: Floats, rates: Floats, on_board
 
 
 @compiled
+def cubic(x: float, way: float, first: float, last: float) -> float:
+    """Return how much of a way is done at a share x in [0, 1] of its time.
+
+    Beside the straight way stands how far it would go at the first rate beyond it, and how far it would fall short of
+    it at the last one.
+    """
+    return x * way + x * (1.0 - x) * ((1.0 - x) * first + x * last)
+
+
+@compiled
 def add_motion_of_path(
     parent: Ints,
     tree: Floats,
@@ -647,7 +657,7 @@ def add_motion_of_path(
     end: Floats,
     time: float,
     R: Floats,
-    turned: Floats,
+    turning: Floats,
     work: Floats,
     moved: Floats,
 ) -> None:
@@ -662,7 +672,7 @@ def add_motion_of_path(
         end: The same at the end (2, n).
         time: In between.
         R: Rotation of the base at the start (9,).
-        turned: Its rotation vector from there to the end (3,).
+        turning: Its rotation vector from there to the end, and its rates at both ends (3, 3), base axes.
         work: As large as `scratch_of` says, overwritten.
         moved: (k,), added to.
     """
@@ -673,12 +683,13 @@ def add_motion_of_path(
         x = NODES[node]
         for j in range(n):
             way = end[0, j] - start[0, j]
-            first, last = start[1, j] * time - way, way - end[1, j] * time  # of the cubic, beside the straight way
-            q[j] = start[0, j] + x * way + x * (1.0 - x) * ((1.0 - x) * first + x * last)
+            first, last = start[1, j] * time - way, way - end[1, j] * time
+            q[j] = start[0, j] + cubic(x, way, first, last)
             rates[j] = way + (1.0 - x) * (1.0 - 3.0 * x) * first + x * (2.0 - 3.0 * x) * last
             rates[j] /= time
         for c in range(3):
-            part[c] = x * turned[c]
+            first, last = turning[1, c] * time - turning[0, c], turning[0, c] - turning[2, c] * time
+            part[c] = cubic(x, turning[0, c], first, last)
         turn(R, part, now)
         for c in range(3):
             on_board[c] = on_board[3 + c] = 0.0
@@ -878,7 +889,7 @@ def advance(
     protects = settings[PROTECTS] > 0.0
     U_base, asked, moved = np.empty((6, k)), np.empty(k), np.empty(6)
     torque, share = drives[TORQUE], own_work[2 * n + 7 + SHARE]
-    turned, R_piece, per_piece = np.zeros(3), np.empty(9), int(settings[STEPS_PER_PIECE])
+    turning, R_piece, per_piece = np.zeros((3, 3)), np.empty(9), int(settings[STEPS_PER_PIECE])
     if prescribed and first == 0:
         totals[WORK] += jump(parent, tree, free, given, driven, command, q, v, work, change)
     cut = False
@@ -888,7 +899,8 @@ def advance(
         if k > 0 and step % per_piece == 0:
             start_piece(driven, q, v, step == 0, piece)
             R_piece[:] = pose[:9]
-            turned[:] = 0.0
+            turning[0] = 0.0
+            turning[1] = v[3:6]
         if not prescribed and step % int(settings[STEPS_PER_TORQUE]) == 0:
             span = h * settings[STEPS_PER_TORQUE]
             for c in range(6):
@@ -991,7 +1003,7 @@ def advance(
         for c in range(6):
             totals[TWIST + c] += moved[c]
         for c in range(3):
-            turned[c] += moved[3 + c]
+            turning[0, c] += moved[3 + c]
         turn(pose[:9], sum_u, R)
         for c in range(9):
             pose[c] = R[c]
@@ -1011,18 +1023,17 @@ def advance(
         if k > 0 and ((step + 1) % per_piece == 0 or step + 1 == int(settings[STEPS])):
             span = h * (step % per_piece + 1)
             end_piece(driven, q, v, piece)
+            turning[2] = v[3:6]
             if settings[DIFFERS] > 0.0:
                 start, end = piece[0:2], piece[2:4]
                 model = parts[MODEL]
-                add_motion_of_path(
-                    own_parent, own_tree, U, settings, start, end, span, R_piece, turned, own_work, model
-                )
+                add_motion_of_path(own_parent, own_tree, U, settings, start, end, span, R_piece, turning, own_work, model)
             else:
                 parts[MODEL] = parts[TRUTH]
             plan_piece(command, h * (step + 1) - span, h * (step + 1), piece)
             start, end = piece[0:2], piece[2:4]
             add_motion_of_path(
-                own_parent, own_tree, U, settings, start, end, span, R_piece, turned, own_work, parts[PLAN]
+                own_parent, own_tree, U, settings, start, end, span, R_piece, turning, own_work, parts[PLAN]
             )
     if prescribed:
         for j in range(n):
