@@ -13,7 +13,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError, ModelError, as_not_negative, as_positive
+from ssm_decouple.model.folded import flat_collisions, has_many_fixed_links
 from ssm_decouple.model.robot import Robot
+from ssm_decouple.model.urdf import parse_urdf
 
 Floats = NDArray[np.float64]
 Pair = tuple[str, str]
@@ -275,8 +277,10 @@ def _rates(J: Floats, normals: Floats, points: Floats, carried: Floats) -> Float
 
 
 def _geometry(robot: Robot) -> pin.GeometryModel:
+    root = parse_urdf(robot.urdf, robot.name)
+    text = flat_collisions(root) if has_many_fixed_links(root) else robot.urdf
     try:
-        geometry = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
+        geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.COLLISION)
     except (ValueError, RuntimeError) as error:
         why = " ".join(str(error).split())
         raise ModelError(

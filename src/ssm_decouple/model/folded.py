@@ -38,7 +38,7 @@ def has_many_fixed_links(root: ET.Element) -> bool:
 def folded_model(root: ET.Element, build: Callable[[str], pin.Model]) -> pin.Model:
     """Build the model of a URDF with its fixed links merged into what carries them, and give it their frames.
 
-    Joints have the order in which Pinocchio reads the file as it is: depth first, siblings by the names of their joints.
+    Joints have the order in which Pinocchio reads any file: depth first, siblings by the names of their joints.
 
     Args:
         root: A URDF in which nothing is impossible.
@@ -57,7 +57,30 @@ def folded_model(root: ET.Element, build: Callable[[str], pin.Model]) -> pin.Mod
         joint = model.addFrame(pin.Frame(*made, part.inertia), False)
         link = pin.Frame(part.link, carriers[part.carrier], joint, part.pose, pin.FrameType.BODY)
         places[part.link] = model.addFrame(link, False)
+    above = {joint.get("name"): _end(joint, "parent") for joint in root.findall("joint")}
+    for frame in model.frames:
+        if frame.type == pin.FrameType.JOINT and frame.name in above:
+            frame.parentFrame = places[above[frame.name]]
     return model
+
+
+def flat_collisions(root: ET.Element) -> str:
+    """Return URDF text of the links that have collision shapes, all fixed to the root link.
+
+    Pinocchio reads shapes by the name of their link, whose place its model knows, not by how links are joined.
+    """
+    flat, start = ET.Element("robot", name=root.get("name", "")), root_link(root)
+    flat.extend(root.findall("material"))
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        if name != start and link.find("collision") is None:
+            continue
+        flat.append(link)
+        if name != start:
+            joint = ET.SubElement(flat, "joint", name=name, type="fixed")
+            ET.SubElement(joint, "parent", link=start)
+            ET.SubElement(joint, "child", link=name)
+    return ET.tostring(flat, encoding="unicode")
 
 
 def _fold(root: ET.Element) -> tuple[ET.Element, list[_Held], dict[str, str]]:

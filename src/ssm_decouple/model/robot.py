@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from ssm_decouple.momentum.coupling import Coupling
 
 Floats = NDArray[np.float64]
+MANY_GIGABYTES, MOST_GIGABYTES = 1.0, 5.0  # from 309 and from 532 joints on
 UNLIMITED = 1e300  # Pinocchio writes the largest double where a URDF gives no limit
 
 
@@ -86,6 +87,7 @@ class Robot:
             raise ModelError(f"robot '{name}': Pinocchio cannot read it: {error}") from error
         self.model.gravity.setZero()  # Pinocchio's own default would be in whatever a user computes with the model
         self._refuse_lost_mass(root)
+        _refuse_too_many_joints(self.model, name)
         self._data = pin.Data(self.model)
         self._neutral: Floats = pin.neutral(self.model)
         self.n_joints: int = self.model.nv - 6
@@ -420,6 +422,19 @@ class Robot:
         from ssm_decouple.model.report import Report
 
         return Report.of_robot(self)
+
+
+def _refuse_too_many_joints(model: pin.Model, name: str) -> None:
+    """Say what Pinocchio's four tensors of second derivatives take: each of its data holds them, used or not."""
+    gigabytes = 4 * 8e-9 * model.nv**3
+    needs = (
+        f"robot '{name}' has {model.nv - 6} joints; Pinocchio's working memory grows with the cube of their number, "
+        f"{gigabytes:.2g} GB for each robot and each law"
+    )
+    if gigabytes > MOST_GIGABYTES:
+        raise ModelError(f"{needs}: lock joints that may stand, with their links merged")
+    if gigabytes > MANY_GIGABYTES:
+        warnings.warn(needs, DecoupleWarning, stacklevel=4)
 
 
 def _built(root: ET.Element, urdf: str) -> pin.Model:
