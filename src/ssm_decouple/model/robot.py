@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from ssm_decouple.momentum.coupling import Coupling
 
 Floats = NDArray[np.float64]
-MANY_GIGABYTES, MOST_GIGABYTES = 1.0, 5.0  # from 309 and from 532 joints on
+MANY_GIGABYTES, MOST_GIGABYTES = 1.0, 5.0  # from 309 and from 533 joints on
 UNLIMITED = 1e300  # Pinocchio writes the largest double where a URDF gives no limit
 
 
