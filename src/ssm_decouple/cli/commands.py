@@ -229,10 +229,10 @@ def plot(
 
 @app.command()
 def check(
-    robot: Annotated[str, typer.Argument(help="A URDF or TOML file, or the name of a robot of the catalogue.")],
+    robot: Annotated[str, typer.Argument(help="A URDF, MJCF or TOML file, or the name of a robot of the catalogue.")],
     as_json: AsJson = False,
 ) -> None:
-    """Say what a robot is made of and what is suspicious or impossible in its URDF.
+    """Say what a robot is made of and what is suspicious or impossible in its file.
 
     Exit status 1 if it cannot be used.
     """

@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from ssm_decouple.errors import InputError, ModelError, as_items, as_not_negative, as_positive, shown
 from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.plain import parser_heard, pinocchio_text
+from ssm_decouple.errors import InputError, ModelError, as_not_negative, as_positive
+from ssm_decouple.model.folded import flat_collisions, has_many_fixed_links
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.model.urdf import parse_urdf
 
@@ -289,7 +291,8 @@ def _rates(J: Floats, normals: Floats, points: Floats, carried: Floats) -> Float
 
 
 def _geometry(robot: Robot) -> pin.GeometryModel:
-    text = pinocchio_text(parse_urdf(robot.urdf, robot.name), shapes="collision")
+    root = parse_urdf(robot.urdf, robot.name)
+    text = flat_collisions(root) if has_many_fixed_links(root) else pinocchio_text(root, shapes="collision")
     said: list[str] = []
     try:
         with parser_heard(said):

@@ -38,7 +38,7 @@ class Description:
 
     Attributes:
         name: Name of the robot.
-        urdf: Path of its URDF.
+        urdf: Path of its URDF or MJCF.
         end_effector: Frame that the tasks move; None as in `load_robot`.
         appendages: What a TOML robot adds to the URDF.
     """
@@ -86,11 +86,12 @@ def find_urdf(source: str | Path) -> Path:
 
 
 def load_robot(source: str | Path, end_effector: str | None = None) -> Robot:
-    """Load a robot: a catalogue name such as "ets_vii", or a path to any URDF, or to a TOML file that adds to one.
+    """Load a robot: a catalogue name such as "ets_vii", or a path to a URDF, an MJCF, or a TOML file that adds to one.
 
     Args:
-        source: Catalogue name or path. The URDF's root link becomes the free-floating base. A TOML file, by its suffix,
-            names a URDF and the flexible appendages on its root link: see `Appendage`.
+        source: Catalogue name or path. The URDF's root link becomes the free-floating base. An MJCF file, by its root
+            element, is rewritten as a URDF. A TOML file, by its suffix, names a URDF or MJCF and the flexible
+            appendages on its root link: see `Appendage`.
         end_effector: The link or frame that the tasks move. None takes the TOML file's own, else the link called
             "end_effector", else the only tip of the arm.
 
@@ -98,8 +99,9 @@ def load_robot(source: str | Path, end_effector: str | None = None) -> Robot:
         The robot.
 
     Raises:
-        ModelError: no such robot, not a URDF, impossible to simulate, or no such end-effector; a TOML file with an
-            unknown key (the nearest known one is named), a missing one, or an appendage that makes no sense.
+        ModelError: no such robot, a file of another format (the message says how to convert it), one that is impossible
+            to simulate, or no such end-effector; a TOML file with an unknown key (the nearest known one is named), a
+            missing one, or an appendage that makes no sense.
     """
     if end_effector is not None:
         as_text("end_effector", end_effector, "it is the name of a link or frame, or None")

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import pinocchio as pin
 
-from ssm_decouple.model.urdf import Body, floats, read_body, root_link, triple, write_body
+from ssm_decouple.model.urdf import Body, floats, joint_end, read_body, root_link, triple, write_body
 
 MANY = 1000  # fixed joints that Pinocchio's reader still takes in a tenth of a second, and in any stack
 
@@ -38,7 +38,7 @@ def has_many_fixed_links(root: ET.Element) -> bool:
 def folded_model(root: ET.Element, build: Callable[[str], pin.Model]) -> pin.Model:
     """Build the model of a URDF with its fixed links merged into what carries them, and give it their frames.
 
-    Joints have the order in which Pinocchio reads the file as it is: depth first, siblings by the names of their joints.
+    Joints have the order in which Pinocchio reads any file: depth first, siblings by the names of their joints.
 
     Args:
         root: A URDF in which nothing is impossible.
@@ -57,7 +57,30 @@ def folded_model(root: ET.Element, build: Callable[[str], pin.Model]) -> pin.Mod
         joint = model.addFrame(pin.Frame(*made, part.inertia), False)
         link = pin.Frame(part.link, carriers[part.carrier], joint, part.pose, pin.FrameType.BODY)
         places[part.link] = model.addFrame(link, False)
+    above = {joint.get("name"): joint_end(joint, "parent") for joint in root.findall("joint")}
+    for frame in model.frames:
+        if frame.type == pin.FrameType.JOINT and frame.name in above:
+            frame.parentFrame = places[above[frame.name]]
     return model
+
+
+def flat_collisions(root: ET.Element) -> str:
+    """Return URDF text of the links that have collision shapes, all fixed to the root link.
+
+    Pinocchio reads shapes by the name of their link, whose place its model knows, not by how links are joined.
+    """
+    flat, start = ET.Element("robot", name=root.get("name", "")), root_link(root)
+    flat.extend(root.findall("material"))
+    for link in root.findall("link"):
+        name = link.get("name", "")
+        if name != start and link.find("collision") is None:
+            continue
+        flat.append(link)
+        if name != start:
+            joint = ET.SubElement(flat, "joint", name=name, type="fixed")
+            ET.SubElement(joint, "parent", link=start)
+            ET.SubElement(joint, "child", link=name)
+    return ET.tostring(flat, encoding="unicode")
 
 
 def _fold(root: ET.Element) -> tuple[ET.Element, list[_Held], dict[str, str]]:
@@ -65,7 +88,7 @@ def _fold(root: ET.Element) -> tuple[ET.Element, list[_Held], dict[str, str]]:
     links = {link.get("name", ""): link for link in root.findall("link")}
     below: dict[str, list[ET.Element]] = {}
     for joint in root.findall("joint"):
-        below.setdefault(_end(joint, "parent"), []).append(joint)
+        below.setdefault(joint_end(joint, "parent"), []).append(joint)
     folded, held = ET.Element("robot", name=root.get("name", "")), list[_Held]()
     names, bodies = dict[str, str](), dict[str, pin.Inertia]()
     # A link, the joint above it, and where that joint's frame stands in the frame of what carries it.
@@ -74,7 +97,7 @@ def _fold(root: ET.Element) -> tuple[ET.Element, list[_Held], dict[str, str]]:
         link, above, carrier, pose = waiting.pop()
         inertia = _inertia(links[link])
         if above is not None and above.get("type") == "fixed":
-            held.append(_Held(above.get("name", ""), link, carrier, _end(above, "parent"), pose, inertia))
+            held.append(_Held(above.get("name", ""), link, carrier, joint_end(above, "parent"), pose, inertia))
         else:
             if above is not None:
                 number = f"{len(names):09d}"
@@ -83,7 +106,7 @@ def _fold(root: ET.Element) -> tuple[ET.Element, list[_Held], dict[str, str]]:
             carrier, pose = link, pin.SE3.Identity()
         bodies[carrier] = bodies.get(carrier, pin.Inertia.Zero()) + pose.act(inertia)
         siblings = sorted(below.get(link, []), key=lambda each: each.get("name", "").encode(), reverse=True)
-        waiting += [(_end(joint, "child"), joint, carrier, pose * _origin(joint)) for joint in siblings]
+        waiting += [(joint_end(joint, "child"), joint, carrier, pose * _origin(joint)) for joint in siblings]
     for carrier, inertia in bodies.items():
         write_body(ET.SubElement(folded, "link", name=carrier), Body(inertia.mass, inertia.lever, inertia.inertia))
     return folded, held, names
@@ -100,11 +123,6 @@ def _moving(joint: ET.Element, number: str, carrier: str, pose: pin.SE3) -> ET.E
             moved.remove(origin)
         ET.SubElement(moved, "origin", xyz=triple(pose.translation), rpy=triple(pin.rpy.matrixToRpy(pose.rotation)))
     return moved
-
-
-def _end(joint: ET.Element, role: str) -> str:
-    element = joint.find(role)
-    return "" if element is None else element.get("link", "")
 
 
 def _origin(joint: ET.Element) -> pin.SE3:

@@ -27,9 +27,14 @@ def massless_root(model: pin.Model) -> list[Finding]:
     return [Finding("suspicious", f"link {_moved(model, 1)}", message)]
 
 
-def massless_joints(model: pin.Model) -> list[Finding]:
-    """Say which joints carry links without inertia about their axis, or without mass along it."""
-    data = pin.Data(model)
+def massless_joints(model: pin.Model, data: pin.Data | None = None) -> list[Finding]:
+    """Say which joints carry links without inertia about their axis, or without mass along it.
+
+    Args:
+        model: With a free-flyer root.
+        data: To compute on; None makes one.
+    """
+    data = pin.Data(model) if data is None else data
     pin.crba(model, data, pin.neutral(model), pin.Convention.LOCAL)
     found = []
     for joint in range(2, model.njoints):

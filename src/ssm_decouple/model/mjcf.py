@@ -65,6 +65,7 @@ class _Conversion:
         self.joints: dict[str, ET.Element] = {}
         self.notes: list[str] = []
         self.undrawn = 0
+        self.waiting: list[tuple[ET.Element, _Place, str]] = []
         self.refs: dict[str, float] = {}
         self.taken = {
             element.get("name", "")
@@ -95,6 +96,8 @@ class _Conversion:
             self._body(element, place, root)
         else:
             self._contents(element, place, root, where)
+        while self.waiting:  # no recursion: bodies may stand in each other by the thousand
+            self._body(*self.waiting.pop())
         self._take_equalities()
         self._take_actuators()
         self._scale_total()
@@ -176,8 +179,8 @@ class _Conversion:
                 pose, _ = shape_pose(given, self.compiler)
                 joint = self._fixed(link, self._link(self._site_name(child.get("name", ""))), at.pose * pose)
                 ET.SubElement(joint, "site")
-            elif child.tag == "body":
-                self._body(child, at, link)
+        bodies = [(child, at, link) for child, at in inside if child.tag == "body"]
+        self.waiting += reversed(bodies)
 
     def _site_name(self, name: str) -> str:
         bodies = {body.get("name") for world in self.worlds for body in world.iter("body")}

@@ -195,7 +195,7 @@ class Report:
             findings=(
                 *robot.findings,
                 *massless_root(model),
-                *massless_joints(model),
+                *massless_joints(model, robot._data),
                 *inspect_remaining_bus(root, robot.appendages),
             ),
             flexible=FlexibleReport.of_robot(robot) if robot.appendages else None,

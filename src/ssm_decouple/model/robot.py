@@ -42,6 +42,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 UNIT = 1e-6  # how far the length of a quaternion may be off, as in the law's kernel
 FARTHEST = 4 * np.pi  # rad: beyond it the position of a joint looks like degrees
+MANY_GIGABYTES, MOST_GIGABYTES = 1.0, 5.0  # from 309 and from 533 joints on
 
 _MIMICS = "it has joints that mimic others"
 _FRAMES = (pin.FrameType.BODY, pin.FrameType.OP_FRAME, pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT)
@@ -105,6 +106,7 @@ class Robot(Settled):
         except ModelError as error:
             raise ModelError(f"robot '{name}': {error}") from error
         self.model.gravity.setZero()  # Pinocchio's own default would be in whatever a user computes with the model
+        _refuse_too_many_joints(self.model, name)
         self._data = pin.Data(self.model)
         self._neutral: Floats = pin.neutral(self.model)
         self.n_joints: int = self.model.nv - 6
@@ -528,6 +530,19 @@ def mimics_told() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", f".*{_MIMICS}", DecoupleWarning)
         yield
+
+
+def _refuse_too_many_joints(model: pin.Model, name: str) -> None:
+    """Say what Pinocchio's four tensors of second derivatives take: each of its data holds them, used or not."""
+    gigabytes = 4 * 8e-9 * model.nv**3
+    needs = (
+        f"robot '{name}' has {model.nv - 6} joints; Pinocchio's working memory grows with the cube of their number, "
+        f"{gigabytes:.2g} GB for each robot and each law"
+    )
+    if gigabytes > MOST_GIGABYTES:
+        raise ModelError(f"{needs}: lock joints that may stand, with their links merged")
+    if gigabytes > MANY_GIGABYTES:
+        warnings.warn(needs, DecoupleWarning, stacklevel=4)
 
 
 def rigid_pose(name: str, pose: pin.SE3 | ArrayLike) -> pin.SE3:

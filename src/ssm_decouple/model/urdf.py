@@ -280,12 +280,13 @@ def tip_links(root: ET.Element) -> list[str]:
 
     Neither a wheel's rotor is one nor a frame that only marks a place: of the latter the link that it is fixed to.
     """
-    joints = [joint for joint in root.findall("joint") if joint.find("site") is None]
-    marks = {_end(joint, "child") for joint in root.findall("joint")} - {_end(joint, "child") for joint in joints}
-    parents = {_end(joint, "parent") for joint in joints}
+    every = root.findall("joint")
+    joints = [joint for joint in every if joint.find("site") is None]
+    marks = {joint_end(joint, "child") for joint in every if joint.find("site") is not None}
+    parents = {joint_end(joint, "parent") for joint in joints}
     below: dict[str, list[ET.Element]] = {}
     for joint in joints:
-        below.setdefault(_end(joint, "parent"), []).append(joint)
+        below.setdefault(joint_end(joint, "parent"), []).append(joint)
     moved, waiting = set(), [(root_link(root), False)]
     while waiting:
         link, moves = waiting.pop()
@@ -293,12 +294,13 @@ def tip_links(root: ET.Element) -> list[str]:
             moved.add(link)
         for joint in below.get(link, ()):
             turns = joint.get("type") != "fixed" and joint.find("wheel") is None
-            waiting.append((_end(joint, "child"), moves or turns))
+            waiting.append((joint_end(joint, "child"), moves or turns))
     names = [link.get("name", "") for link in root.findall("link")]
     return [name for name in names if name not in parents and name in moved and name not in marks]
 
 
-def _end(joint: ET.Element, role: str) -> str:
+def joint_end(joint: ET.Element, role: str) -> str:
+    """Return the name of the link that is a joint's "parent" or "child"."""
     element = joint.find(role)
     return "" if element is None else element.get("link", "")
 
