@@ -13,10 +13,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError, ModelError, as_items, as_not_negative, as_positive, shown
+from ssm_decouple.model.folded import flat_collisions, has_many_fixed_links
 from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.plain import parser_heard, pinocchio_text
-from ssm_decouple.errors import InputError, ModelError, as_not_negative, as_positive
-from ssm_decouple.model.folded import flat_collisions, has_many_fixed_links
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.model.urdf import parse_urdf
 

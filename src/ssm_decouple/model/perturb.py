@@ -9,9 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError, as_floats, as_kind, as_seed, shown
-from ssm_decouple.model.robot import Robot, checked_robot
-from ssm_decouple.errors import InputError, as_floats, as_seed
-from ssm_decouple.model.robot import Robot, mimics_told
+from ssm_decouple.model.robot import Robot, checked_robot, mimics_told
 from ssm_decouple.model.urdf import parse_urdf, root_link
 
 Floats = NDArray[np.float64]

@@ -606,7 +606,7 @@ def _validate(spec: Mapping[str, Any]) -> None:
     for key in spec.keys() & {"samples", "chunk"}:
         if not (isinstance(spec[key], int) and spec[key] > 0):
             raise InputError(f"{key} is {spec[key]!r}; it must be a whole number above 0")
-    chunk = spec.get("chunk", CHUNK)
+    chunk = as_count("chunk", spec.get("chunk", CHUNK), MOST_IN_CHUNK)
     if chunk > MOST_IN_CHUNK:
         raise InputError(f"chunk is {chunk}; a chunk is computed in memory, and holds {MOST_IN_CHUNK} samples at most")
     _check_names(spec, "cases")

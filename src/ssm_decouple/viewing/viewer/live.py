@@ -27,8 +27,6 @@ from ssm_decouple.simulation.motion import judge, twist_along
 from ssm_decouple.studies.case import Case, cases, load_case
 from ssm_decouple.viewing.viewer.page import Page, chosen_pace, one_of
 from ssm_decouple.viewing.viewer.parts import Part, antenna, drawn_reach, spacecraft_parts
-from ssm_decouple.viewing.viewer.plots import AXES, FLOOR, HEIGHT, POINTS, caption
-from ssm_decouple.viewing.viewer.parts import Part, antenna, spacecraft_parts
 from ssm_decouple.viewing.viewer.plots import AXES, FLOOR, FLOORED, HEIGHT, POINTS, caption
 from ssm_decouple.viewing.viewer.scene import Vectors, body_poses, rotated, split_rate
 from ssm_decouple.viewing.viewer.server import HOST, PORT
