@@ -126,14 +126,16 @@ def as_not_negative(name: str, value: float, needs: str = "it must be zero or a 
     return as_number(name, value, needs, -5e-324)  # the number before zero
 
 
-def as_whole(name: str, value: int, least: int = 1, needs: str = "") -> int:
-    """Return a whole number that has to be at least another one.
+def as_whole(name: str, value: int, least: int = 1, needs: str = "", most: int = 2**53) -> int:
+    """Return a whole number that has to be at least one number and at most another one.
 
     Raises:
         InputError: it is not; the message calls it `name` and ends with `needs`.
     """
     if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise InputError(f"{name} is {shown(value)}; {needs or f'it must be a whole number from {least}'}")
+    if value > most:
+        raise InputError(f"{name} is {shown(value)}; it is {most} at most")
     return int(value)
 
 
@@ -201,9 +203,12 @@ def as_items(name: str, values: Iterable[T], mend: str) -> list[T]:
     Raises:
         InputError: it is none, or a text or a table; the message calls it `name` and ends with `mend`.
     """
-    if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
-        raise InputError(f"{name} is {shown(values)}; {mend}")
-    return list(values)
+    if isinstance(values, Iterable) and not isinstance(values, str | bytes | Mapping):
+        try:
+            return list(values)
+        except TypeError:  # an array of no dimension
+            pass
+    raise InputError(f"{name} is {shown(values)}; {mend}")
 
 
 def as_function(name: str, value: Callable[..., T] | None) -> Callable[..., T] | None:

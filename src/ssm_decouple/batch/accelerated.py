@@ -65,7 +65,7 @@ class JaxBatch(Engine):
             "give a positive whole number, or None",
         )
         self.chunk: int = (
-            usual if chunk is None else as_whole("chunk", chunk, 1, f"{needs} for one that suits the device")
+            usual if chunk is None else as_whole("chunk", chunk, 1, f"{needs} for one that suits the device", 2**20)
         )
         self._compiled: dict[tuple[Any, ...], Any] = {}
 

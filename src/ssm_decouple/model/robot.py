@@ -307,7 +307,10 @@ class Robot(Settled):
 
     def _refuse_singular_inertia(self) -> None:
         pin.computeCentroidalMap(self.model, self._data, self._neutral)
-        smallest, *_, largest = np.linalg.eigvalsh(np.array(self._data.Ag[3:, 3:6]))
+        inertia = np.array(self._data.Ag[3:, 3:6])
+        if not np.all(np.isfinite(inertia)):
+            raise ModelError(f"robot '{self.name}': the inertia of the whole overflows; look at its masses and lengths")
+        smallest, *_, largest = np.linalg.eigvalsh(inertia)
         if not smallest > 1e-12 * largest:
             raise ModelError(
                 f"robot '{self.name}': the whole has no rotational inertia about some axis (principal moments "
@@ -370,12 +373,9 @@ class Robot(Settled):
         Raises:
             InputError: no such joint.
         """
-        try:
-            return self.joint_names.index(name)
-        except ValueError:
-            raise InputError(
-                f"'{self.name}' has no joint {shown(name)}; it has {', '.join(self.joint_names)}"
-            ) from None
+        if not isinstance(name, str) or name not in self.joint_names:
+            raise InputError(f"'{self.name}' has no joint {shown(name)}; it has {', '.join(self.joint_names)}")
+        return self.joint_names.index(name)
 
     def joint_positions(self, q: ArrayLike) -> Floats:
         """Return the joint positions (n,), rad or m, of a configuration; continuous joints within (-pi, pi]."""

@@ -163,7 +163,7 @@ class Robustness(Settled):
                 raise InputError(f"level {level} is no tolerance: give shares above 0 and below 1, 0.05 for 5 %")
         self.runs = as_whole("runs", self.runs, 1, "give at least 1")
         self.feedback_gain = as_positive("feedback_gain", self.feedback_gain, "it must be positive, 1/s")
-        self.workers = as_whole("workers", self.workers, 1, "give at least 1")
+        self.workers = as_whole("workers", self.workers, 1, "give at least 1", 1024)
         self.seed = as_seed("seed", self.seed)
         if self.case.protection.k == 0 or np.any(self.case.protection.U_twist[:3]):
             raise InputError(f"case '{self.case.name}' needs a protection of rotation: one to three directions")

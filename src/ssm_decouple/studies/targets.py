@@ -28,6 +28,7 @@ Flags = NDArray[np.bool_]
 Triple = tuple[float, float, float]
 
 COUNT = 10_000
+MOST = 10**6  # more would fill the memory
 DRAWN = 8192  # random starts that are looked at together
 TRIES = 64  # so many times before there seem to be none
 INTERVALS = 16  # of a joint path, over which the base is integrated
@@ -141,7 +142,7 @@ def end_of_path(robot: Robot, configurations: Floats, goals: Floats, intervals: 
     """
     engine = Batch(robot)
     joints, poses = engine.split(configurations)
-    goals, intervals = as_floats("goals", goals), as_whole("intervals", intervals)
+    goals, intervals = as_floats("goals", goals), as_whole("intervals", intervals, most=MOST)
     if goals.shape != joints.shape:
         raise InputError(f"goals have shape {goals.shape}; {len(joints)} configurations need {joints.shape}")
     way, h = goals - joints, 1.0 / intervals
@@ -576,4 +577,4 @@ def _percentiles(values: Floats, share: float) -> Triple | None:
 
 
 def _check_count(count: int) -> None:
-    as_whole("count of targets", count, 1, "give a whole number from 1")
+    as_whole("count of targets", count, 1, "give a whole number from 1", MOST)
