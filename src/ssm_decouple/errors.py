@@ -129,14 +129,17 @@ def as_not_negative(name: str, value: float, needs: str = "it must be zero or a 
     return as_number(name, value, needs, -5e-324)  # the number before zero
 
 
-def as_whole(name: str, value: int, least: int = 1, needs: str = "") -> int:
-    """Return a whole number that has to be at least another one.
+def as_whole(name: str, value: int, least: int = 1, needs: str = "", most: int = 2**53) -> int:
+    """Return a whole number that has to be at least one number and at most another one.
 
     Raises:
         InputError: it is not; the message calls it `name` and ends with `needs`.
     """
     if not isinstance(value, Integral) or isinstance(value, bool) or value < least:
         raise InputError(f"{name} is {shown(value)}; {needs or f'it must be a whole number from {least}'}")
+    if value > most:
+        told = f"{int(value):,}" if value < 10**30 else "above 1e30"
+        raise InputError(f"{name} is {told}; {most:,} at most")
     return int(value)
 
 
@@ -146,7 +149,7 @@ def as_seed(name: str, value: int) -> int:
     Raises:
         InputError: it is no whole number from 0; the message calls it `name`.
     """
-    return as_whole(name, value, 0)
+    return as_whole(name, value, 0, most=2**63 - 1)
 
 
 def as_switch(name: str, value: bool) -> bool:
@@ -204,9 +207,12 @@ def as_items(name: str, values: Iterable[T], mend: str) -> list[T]:
     Raises:
         InputError: it is none, or a text or a table; the message calls it `name` and ends with `mend`.
     """
-    if isinstance(values, str | bytes | Mapping) or not isinstance(values, Iterable):
-        raise InputError(f"{name} is {shown(values)}; {mend}")
-    return list(values)
+    if isinstance(values, Iterable) and not isinstance(values, str | bytes | Mapping):
+        try:
+            return list(values)
+        except TypeError:  # an array of no dimension
+            pass
+    raise InputError(f"{name} is {shown(values)}; {mend}")
 
 
 def as_function(name: str, value: Callable[..., T] | None) -> Callable[..., T] | None:
@@ -218,19 +224,6 @@ def as_function(name: str, value: Callable[..., T] | None) -> Callable[..., T] |
     if value is not None and not callable(value):
         raise InputError(f"{name} is {shown(value)}; it must be a function, or None")
     return value
-
-
-def as_count(name: str, value: int, most: int, needs: str = "give a whole number from 1") -> int:
-    """Return a whole number from 1 to `most`: how often something is done or kept.
-
-    Raises:
-        InputError: it is none, and the message ends with `needs`, or above `most`; the message calls it `name`.
-    """
-    count = as_whole(name, value, 1, needs)
-    if count > most:
-        told = f"{count:,}" if count < 10**30 else "above 1e30"
-        raise InputError(f"{name} is {told}; {most:,} at most")
-    return count
 
 
 def refuse_more_than_fits(what: str, size: float, mend: str) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from ssm_decouple.batch.base import Engine, Floats, Judge, Progress, Wanted
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError, as_count, as_floats, as_kind, shown
+from ssm_decouple.errors import InputError, as_floats, as_kind, as_whole, shown
 from ssm_decouple.model.origin import FAR
 from ssm_decouple.model.robot import UNIT, Robot
 from ssm_decouple.momentum.protection import Protection
@@ -64,7 +64,7 @@ class JaxBatch(Engine):
         self.device = _device(device)
         usual = ON_PROCESSOR if self.device.platform == "cpu" else ON_GPU
         needs = "give a positive whole number, or None for one that suits the device"
-        self.chunk: int = usual if chunk is None else as_count("chunk", chunk, MOST_CHUNK, needs)
+        self.chunk: int = usual if chunk is None else as_whole("chunk", chunk, 1, needs, MOST_CHUNK)
         self._compiled: dict[tuple[Any, ...], Any] = {}
 
     def __repr__(self) -> str:

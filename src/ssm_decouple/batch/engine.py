@@ -15,7 +15,6 @@ from ssm_decouple.batch import lanes, rows
 from ssm_decouple.batch.base import NO_ROWS, Engine, Floats, Judge, Progress, Wanted
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import as_count
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 
@@ -48,7 +47,7 @@ class Batch(Engine):
     def __init__(self, robot: Robot, end_effector: str | None = None, threads: int | None = None) -> None:
         super().__init__(robot, end_effector)
         needs = "give a positive whole number, or None for one a processor"
-        count = None if threads is None else as_count("threads", threads, MOST_THREADS, needs)
+        count = None if threads is None else as_whole("threads", threads, 1, needs, MOST_THREADS)
         self.threads: int = count or os.cpu_count() or 1
 
     def __repr__(self) -> str:

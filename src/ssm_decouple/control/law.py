@@ -668,7 +668,7 @@ class SelectiveLaw(Settled):
             target_velocity = velocities
         model, data, _, _, fixed = self._prepared
         try:  # arrays of the right kind are not looked at twice
-            if not (type(q) is type(target) is type(target_velocity) is array):
+            if not (type(q) is type(target) is type(target_velocity) is type(out) is array):
                 raise TypeError  # a subclass: a masked array would pass as what lies under its mask
             centroidal_map(model, data, q)
             # A q that Pinocchio reads in its own way, such as one of another byte order, does not fit here.

@@ -288,6 +288,8 @@ class Modes:
         """
         per_appendage = as_whole("per_appendage", per_appendage)
         appendages = checked_appendages(appendages)
+        if not appendages:
+            raise InputError("there is no appendage and so no mode; build one with ssm_decouple.Appendage(..)")
         for appendage in appendages:
             if per_appendage > appendage.segments:
                 raise InputError(

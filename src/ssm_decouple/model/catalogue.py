@@ -185,9 +185,10 @@ def example_robot(path: str) -> Path:
         raise ModelError("example-robot-data is not installed: pip install 'ssm-decouple[robots]'") from None
     robots = Path(str(distribution.locate_file("cmeel.prefix/share/example-robot-data/robots")))
     found = robots / path
-    if not found.is_file():
+    if not (is_file(found) and found.is_relative_to(robots)):
         first = Path(path).parts[0] if Path(path).parts else ""
-        near = sorted((robots / first).rglob("*.urdf")) or sorted(robots.rglob("*.urdf"))
+        near = sorted(robots.rglob("*.urdf"))
+        near = [urdf for urdf in near if urdf.relative_to(robots).parts[0] == first] or near
         names = ", ".join(str(urdf.relative_to(robots)) for urdf in near[:12])
         raise ModelError(f"example-robot-data has no '{path}'; it has {names}{', ..' if near[12:] else ''}")
     return found

@@ -132,7 +132,14 @@ class Report:
 
     @classmethod
     def of_robot(cls, robot: Robot) -> Report:
-        """Report on a robot that loads."""
+        """Report on a robot that loads.
+
+        Raises:
+            InputError: it is no robot.
+        """
+        from ssm_decouple.model.robot import checked_robot
+
+        checked_robot(robot)
         return cls._of_loaded(robot, robot.end_effector)
 
     @classmethod

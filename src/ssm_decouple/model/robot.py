@@ -387,12 +387,9 @@ class Robot(Settled):
         Raises:
             InputError: no such joint.
         """
-        try:
-            return self.joint_names.index(name)
-        except ValueError:
-            raise InputError(
-                f"'{self.name}' has no joint {shown(name)}; it has {', '.join(self.joint_names)}"
-            ) from None
+        if not isinstance(name, str) or name not in self.joint_names:
+            raise InputError(f"'{self.name}' has no joint {shown(name)}; it has {', '.join(self.joint_names)}")
+        return self.joint_names.index(name)
 
     def joint_positions(self, q: ArrayLike) -> Floats:
         """Return the joint positions (n,), rad or m, of a configuration; continuous joints within (-pi, pi]."""

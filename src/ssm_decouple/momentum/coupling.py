@@ -9,7 +9,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_decouple.errors import InputError, as_floats, shown
+from ssm_decouple.errors import InputError, as_floats, as_text, shown
 from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum import metrics
 
@@ -97,8 +97,9 @@ class Coupling:
         """Return the rotation (3, 3) from the axes of "base", "inertial" or a frame of the robot to those of `frame`.
 
         Raises:
-            ModelError: the robot has no such frame.
+            InputError: the robot has no such frame.
         """
+        as_text("frame", frame, "it is 'base', 'inertial' or the name of a frame of the robot")
         robot, data = self._placed
         if frame in ("base", "inertial"):
             R = self.base_rotation if frame == "base" else np.eye(3)

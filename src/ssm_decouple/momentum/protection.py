@@ -158,8 +158,12 @@ class Protection(Settled):
         return f"k = {self.k}, {self.frame} axes: {'; '.join(words)}{turned}"
 
     def U_c_in(self, coupling: Coupling) -> Floats:
-        """Return U_c, (3, k) or (6, k) as it was given, in the axes of the coupling's matrices."""
-        if self.frame == coupling.frame:
+        """Return U_c, (3, k) or (6, k) as it was given, in the axes of the coupling's matrices.
+
+        Raises:
+            InputError: it is no coupling.
+        """
+        if self.frame == _checked_coupling(coupling).frame:
             return self.U_c
         R = coupling.rotation_of(self.frame)
         return np.vstack([R @ part for part in np.split(self.U_c, len(self.U_c) // 3)])
@@ -186,6 +190,12 @@ class Protection(Settled):
 
     def _map(self, coupling: Coupling) -> Floats:
         return coupling.J_rc if len(self.U_c) == 3 else coupling.J_base
+
+
+def _checked_coupling(coupling: Coupling) -> Coupling:
+    from ssm_decouple.momentum.coupling import Coupling
+
+    return as_kind("coupling", coupling, Coupling, "give what robot.coupling(q) returns")
 
 
 def checked_protection(protection: Protection) -> Protection:

@@ -25,7 +25,6 @@ from ssm_decouple.errors import (
     DecoupleWarning,
     FileError,
     InputError,
-    as_count,
     as_function,
     as_kind,
     as_path,
@@ -606,7 +605,7 @@ def _validate(spec: Mapping[str, Any]) -> None:
     for key in spec.keys() & {"samples", "chunk"}:
         if not (isinstance(spec[key], int) and spec[key] > 0):
             raise InputError(f"{key} is {spec[key]!r}; it must be a whole number above 0")
-    chunk = as_count("chunk", spec.get("chunk", CHUNK), MOST_IN_CHUNK)
+    chunk = spec.get("chunk", CHUNK)
     if chunk > MOST_IN_CHUNK:
         raise InputError(f"chunk is {chunk}; a chunk is computed in memory, and holds {MOST_IN_CHUNK} samples at most")
     _check_names(spec, "cases")

@@ -223,7 +223,8 @@ class Case:
         """Return the case's law, with another protection or time between samples than its own if one is given."""
         step = self.dt if dt is None else dt
         planned = bool(self.law.keys() & {"hold_nodes", "acceleration_limit", "limits"})
-        chosen, sample_time = protection or self.protection, step if planned else None
+        chosen = self.protection if protection is None else protection
+        sample_time = step if planned else None
         if isinstance(chosen, Schedule):
             return ScheduledLaw(self.robot, chosen, sample_time=sample_time, **self.law)
         return SelectiveLaw(self.robot, chosen, sample_time=sample_time, **self.law)

@@ -12,12 +12,12 @@ import numpy as np
 
 from ssm_decouple.errors import (
     InputError,
-    as_count,
     as_items,
     as_not_negative,
     as_number,
     as_positive,
     as_seed,
+    as_whole,
 )
 from ssm_decouple.model.perturb import Tolerances, perturbed
 from ssm_decouple.momentum.protection import Protection
@@ -163,9 +163,9 @@ class Robustness(Settled):
         for level in self.levels:
             if not 0 < level < 1:
                 raise InputError(f"level {level} is no tolerance: give shares above 0 and below 1, 0.05 for 5 %")
-        self.runs = as_count("runs", self.runs, MOST_RUNS, "give at least 1")
+        self.runs = as_whole("runs", self.runs, 1, "give at least 1", MOST_RUNS)
         self.feedback_gain = as_positive("feedback_gain", self.feedback_gain, "it must be positive, 1/s")
-        self.workers = as_count("workers", self.workers, MOST_WORKERS, "give at least 1")
+        self.workers = as_whole("workers", self.workers, 1, "give at least 1", MOST_WORKERS)
         self.seed = as_seed("seed", self.seed)
         if self.case.protection.k == 0 or np.any(self.case.protection.U_twist[:3]):
             raise InputError(f"case '{self.case.name}' needs a protection of rotation: one to three directions")

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ssm_decouple.errors import as_items
+from ssm_decouple.errors import as_function, as_items, as_positive
 from ssm_decouple.studies.case import Case, checked_case
 from ssm_decouple.studies.comparison import disturbance
 
@@ -57,7 +57,9 @@ def sampling(
         One result for each way and time, from the longest time to the shortest.
     """
     checked_case(case)
-    sample_times = as_items("sample_times", sample_times, "give a list of times, s")
+    as_function("progress", progress)
+    given = as_items("sample_times", sample_times, "give a list of times, s")
+    sample_times = [as_positive("sample time", time, "it must be a positive time, s") for time in given]
     for nodes in PLANS:
         before: Drift | None = None
         for dt in sorted(sample_times, reverse=True):

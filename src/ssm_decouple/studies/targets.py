@@ -14,7 +14,7 @@ from ssm_decouple.batch import Batch
 from ssm_decouple.batch.results import Motions
 from ssm_decouple.batch.rows import move_poses, place_points
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError, as_count, as_floats, as_kind, as_number, as_seed, as_whole
+from ssm_decouple.errors import InputError, as_floats, as_kind, as_number, as_seed, as_whole
 from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum.protection import AXES, Protection
 from ssm_decouple.settled import Settled, fixed
@@ -143,7 +143,7 @@ def end_of_path(robot: Robot, configurations: Floats, goals: Floats, intervals: 
     """
     engine = Batch(robot)
     joints, poses = engine.split(configurations)
-    goals, intervals = as_floats("goals", goals), as_whole("intervals", intervals)
+    goals, intervals = as_floats("goals", goals), as_whole("intervals", intervals, most=MOST_TARGETS)
     if goals.shape != joints.shape:
         raise InputError(f"goals have shape {goals.shape}; {len(joints)} configurations need {joints.shape}")
     way, h = goals - joints, 1.0 / intervals
@@ -578,4 +578,4 @@ def _percentiles(values: Floats, share: float) -> Triple | None:
 
 
 def _check_count(count: int) -> None:
-    as_count("count of targets", count, MOST_TARGETS, "give a whole number from 1")
+    as_whole("count of targets", count, 1, "give a whole number from 1", MOST_TARGETS)

@@ -20,7 +20,7 @@ from multiprocessing.connection import Connection, wait
 from types import FrameType
 from typing import Any, Protocol
 
-from ssm_decouple.errors import DecoupleError, FileError, InputError, as_count
+from ssm_decouple.errors import DecoupleError, FileError, InputError, as_whole
 from ssm_decouple.studies.campaign import Campaign, Rows, versions
 
 MOST_WORKERS = 1024
@@ -67,7 +67,7 @@ def pool_of(campaign: Campaign, workers: int, scheduler: str | None, note: Note)
         return cluster
     if workers < 1:
         raise InputError(f"workers is {workers}; give at least 1")
-    as_count("workers", workers, MOST_WORKERS)
+    as_whole("workers", workers, 1, "", MOST_WORKERS)
     return Here(campaign) if workers == 1 else Processes(campaign, workers, note)
 
 

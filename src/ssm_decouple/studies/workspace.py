@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from scipy.stats import qmc, t
 
 from ssm_decouple.batch.engine import Batch
-from ssm_decouple.errors import InputError, as_count, as_floats, as_items, as_positive, as_seed, as_whole
+from ssm_decouple.errors import InputError, as_floats, as_items, as_positive, as_seed, as_whole, shown
 from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.settled import Settled
@@ -258,7 +258,7 @@ class Workspace(Settled):
         self.margin = as_positive("margin", self.margin)
         self.seed = as_seed("seed", self.seed)
         needs = f"give a positive whole number, such as {SAMPLES}"
-        self.samples = as_count("samples", self.samples, MOST_SAMPLES, needs)
+        self.samples = as_whole("samples", self.samples, 1, needs, MOST_SAMPLES)
         self.protections = tuple(as_items("protections", self.protections, "give a list, such as ['none', 'yaw']"))
         self._ranges = joint_ranges(self.robot)
         self.grid = Grid.about(self.robot, self.voxel)
@@ -442,8 +442,12 @@ def joint_slice(
     Raises:
         InputError: no such joint, or one without a range.
     """
-    i, j = (checked_robot(robot).joint_index(name) for name in as_items("joints", joints, "give the names of two"))
-    points = as_count("points", as_whole("points", points, 2), MOST_POINTS)
+    two = as_items("joints", joints, "give the names of two")
+    if len(two) != 2:
+        raise InputError(f"joints is {shown(joints)}; give the names of two")
+    i, j = (checked_robot(robot).joint_index(name) for name in two)
+    points = as_whole("points", points, 2, most=MOST_POINTS)
+    protections = as_items("protections", protections, "give a list, such as ['none', 'yaw']")
     posture = as_floats("posture", posture)
     if posture.shape != (robot.n_joints,):
         raise InputError(f"posture has shape {posture.shape}; it needs ({robot.n_joints},), a position a joint")
@@ -458,7 +462,7 @@ def joint_slice(
 
 def arm_joints(robot: Robot) -> list[str]:
     """Return the names of the joints from the base to the end-effector, then those of all others."""
-    chain = robot.model.supports[robot.model.frames[robot.end_effector_id].parentJoint]
+    chain = checked_robot(robot).model.supports[robot.model.frames[robot.end_effector_id].parentJoint]
     names = [robot.joint_names[joint - 2] for joint in chain if joint > 1]
     return [*names, *(name for name in robot.joint_names if name not in names)]
 
@@ -479,6 +483,9 @@ def interval(shares: Floats, samples: int, confidence: float = CONFIDENCE) -> tu
     Returns:
         Lower and upper end, within 0 and 1.
     """
+    shares, samples = as_floats("shares", shares), as_whole("samples", samples)
+    if shares.ndim != 1 or not shares.size or not np.all((shares >= 0.0) & (shares <= 1.0)):
+        raise InputError(f"shares are {shown(shares.tolist())}; they need numbers from 0 to 1, one a block")
     mean, spread = float(np.mean(shares)), float(np.std(shares, ddof=1)) if len(shares) > 1 else 0.0
     if spread == 0.0:
         return wilson(round(mean * samples), samples, confidence)
