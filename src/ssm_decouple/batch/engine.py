@@ -15,6 +15,7 @@ from ssm_decouple.batch import lanes, rows
 from ssm_decouple.batch.base import NO_ROWS, Engine, Floats, Judge, Progress, Wanted
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
+from ssm_decouple.errors import as_whole
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 
