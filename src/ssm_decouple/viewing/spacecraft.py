@@ -106,7 +106,7 @@ def draw_configurations(motion: xr.Dataset) -> Figure:
         labelled |= dict(zip(labels, handles, strict=True))
     figure.legend(list(labelled.values()), list(labelled), ncols=len(labelled), loc="lower center", borderaxespad=0.2)
     if told:
-        figure.text(0.5, _BOTTOM / _HEIGHT, told, ha="center", va="bottom", fontsize=6, color="#8C8C8C")
+        figure.text(0.01, _BOTTOM / _HEIGHT, told, va="bottom", fontsize=6, color="#8C8C8C")
     return figure
 
 
