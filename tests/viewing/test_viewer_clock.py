@@ -32,7 +32,9 @@ class Visitor:
 
     def __init__(self, page):
         self.page, port = page, page.server.get_port()
-        self.line = connect(f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None)
+        self.line = connect(
+            f"ws://127.0.0.1:{port}", subprotocols=[f"viser-v{viser.__version__}"], max_size=None, close_timeout=0.2
+        )
         before = set(page.server.get_clients())
         self.look()
         until(lambda: set(page.server.get_clients()) - before, "the visitor")

@@ -140,18 +140,19 @@ def test_what_is_not_is_refused_in_a_line_that_says_how(port, lines, upgrade):
 
 
 LITERALS = {f"{name}:81" for name in ("localhost", "localhost.", "127.0.0.1", "127.0.0.1.", "[::1]")}
+LETTERS = st.characters(codec="latin-1", exclude_categories=["Cc"])  # others no header can hold
 near = st.sampled_from(sorted(LITERALS))
 
 
 @given(
     st.one_of(
-        st.text(st.characters(codec="latin-1"), max_size=30),
+        st.text(LETTERS, max_size=30),
         near,
         st.builds(
             lambda text, at, more: text[:at] + more + text[at:],
             near,
             st.integers(0, 14),
-            st.text(st.characters(codec="latin-1"), max_size=3),
+            st.text(LETTERS, max_size=3),
         ),
         st.builds(lambda text, at: text[:at] + text[at + 1 :], near, st.integers(0, 14)),
         st.builds(lambda text, upper: text.upper() if upper else text, near, st.booleans()),

@@ -29,6 +29,7 @@ from ssm_decouple.viewing.style import (
     LAW_LINES,
     PAGE,
     PROTECTED,
+    ROOM,
     floored,
     joint_colors,
     panels,
@@ -193,7 +194,7 @@ def comparison(motions: Mapping[str, xr.Dataset]) -> Figure:
     disturbed.set(
         title=f"rate {about}",
         ylabel=rf"$|\omega_\mathrm{{sub}}|$ ({unit})",
-        ylim=(FLOOR / 3, highest if highest == 1e-1 else 3.0 * highest),
+        ylim=(FLOOR / ROOM, highest if highest == 1e-1 else 3.0 * highest),
     )
     singular.set(title=r"smallest $\sigma$ of $J_{g,t} N_\mathrm{sub}$", ylabel="m")
     for axis, name in zip(angles, AXIS_COLORS, strict=True):
@@ -215,7 +216,7 @@ def sampling(rows: Sequence[Drift]) -> Figure:
     names = list(dict.fromkeys(row.case for row in rows))
     figure, axes = panels(1, len(names), width=PAGE, height=2.3)
     for axis, name in zip(axes, names, strict=True):
-        largest = 1e-1
+        least, largest = 1.0, 1e-1
         for nodes, color in zip(PLANS, ("#8C8C8C", "#56B4E9", "#0072B2", PROTECTED), strict=True):
             mine = sorted(
                 (row.sample_time_s, row.drift_deg) for row in rows if (row.case, row.hold_nodes) == (name, nodes)
@@ -224,12 +225,12 @@ def sampling(rows: Sequence[Drift]) -> Figure:
             axis.loglog(
                 times, np.maximum(drifts, FLOOR_DRIFT), color=color, marker="o", markersize=2.5, label=PLANS[nodes]
             )
-            if min(drifts) <= FLOOR_DRIFT:
-                tell_floor(axis, FLOOR_DRIFT, "deg")
-            largest = max(largest, *drifts)
-        axis.set(
-            title=name, xlabel="sample time (s)", ylim=(FLOOR_DRIFT, largest if largest == 1e-1 else 3.0 * largest)
-        )
+            least, largest = min(least, *drifts), max(largest, *drifts)
+        if least <= FLOOR_DRIFT:
+            tell_floor(axis, FLOOR_DRIFT, "deg")
+        bottom = FLOOR_DRIFT if least > FLOOR_DRIFT else FLOOR_DRIFT / ROOM
+        top = largest if largest == 1e-1 else 3.0 * largest
+        axis.set(title=name, xlabel="sample time (s)", ylim=(bottom, top))
         axis.set_xticks(times, [f"{time:g}" for time in times])
         axis.set_xticks([], minor=True)
     axes[0].set_ylabel("rotation about the\nprotected axes (deg)")

@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 
 _LIGHT = np.array([-0.45, 0.55, 0.75]) / np.linalg.norm([-0.45, 0.55, 0.75])
 _TILES = 20  # along the spacecraft: large faces are cut into tiles, because depth is sorted face by face
+_WAYS = 150
 _ELEVATION, _AZIMUTHS = 24.0, (132.0, 122.0, 112.0, 142.0, 152.0)  # deg; of these the one that shows most of the arm
 _BESIDE = 0.5  # of the spacecraft's size: how far beside it the path and the target are in the picture
 _HEIGHT, _TOP, _BOTTOM = 3.2, 0.5, 0.3  # inches: of the figure, of its titles and of its legend
@@ -105,7 +106,7 @@ def draw_configurations(motion: xr.Dataset) -> Figure:
         labelled |= dict(zip(labels, handles, strict=True))
     figure.legend(list(labelled.values()), list(labelled), ncols=len(labelled), loc="lower center", borderaxespad=0.2)
     if told:
-        figure.text(0.5, _BOTTOM / _HEIGHT, told, ha="center", va="bottom", fontsize=6, color="#8C8C8C")
+        figure.text(0.01, _BOTTOM / _HEIGHT, told, va="bottom", fontsize=6, color="#8C8C8C")
     return figure
 
 
@@ -297,8 +298,13 @@ def _faces(shape: Shape | Part, tile: float = 0.8) -> list[Floats]:
 
 
 def _hull_faces(vertices: Floats) -> list[Floats]:
-    hull = ConvexHull(vertices, qhull_options="QJ")
-    corners, outwards = vertices[hull.simplices], hull.equations[:, :3]
+    """Return the hull of a mesh, of its vertices that are farthest in each of some hundred directions."""
+    k = np.arange(0.5, _WAYS)
+    up, around = 1.0 - 2.0 * k / _WAYS, np.pi * (1.0 + np.sqrt(5.0)) * k  # a spiral, even over the sphere
+    ways = np.vstack([np.sqrt(1.0 - up**2) * np.cos(around), np.sqrt(1.0 - up**2) * np.sin(around), up]).T
+    kept = vertices[np.unique(np.argmax(vertices @ np.vstack([ways, np.eye(3), -np.eye(3)]).T, axis=0))]
+    hull = ConvexHull(kept, qhull_options="QJ")
+    corners, outwards = kept[hull.simplices], hull.equations[:, :3]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 1])
     inwards = np.einsum("fi,fi->f", normals, outwards) < 0
     corners[inwards] = corners[inwards, ::-1]

@@ -16,6 +16,7 @@ from ssm_decouple.files import writable_folder, written_whole
 
 T = TypeVar("T")
 
+ROOM = 30.0  # below the floor of a logarithmic axis, for the words about it
 COLUMN = 3.45  # inches, one column of a two-column page
 PAGE = 7.1
 
@@ -117,7 +118,10 @@ def tell_floor(axes: Axes, floor: float, unit: str) -> None:
         return
     across = axes.get_yaxis_transform()
     axes.hlines(floor, 0.0, 1.0, color="#8C8C8C", linewidth=0.5, linestyle=(0, (1, 1.5)), transform=across)
-    axes.text(0.99, floor, told, transform=across, ha="right", va="bottom", fontsize=5.5, color="#666666")
+    place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "top", "xycoords": across}
+    axes.annotate(told, (0.99, floor), (0.0, -2.5), fontsize=5.5, color="#444444", **place)
+    axes.update_datalim([(axes.dataLim.x1, floor / ROOM)], updatex=False)
+    axes.autoscale_view(scalex=False)
 
 
 def tell_gaps(figure: Figure) -> None:
