@@ -83,8 +83,8 @@ def test_the_plan_is_what_a_perfect_servo_on_the_model_would_do(ets_vii, frame, 
     motion = ssm.simulate(law, ets_vii.configuration(START), TARGET, 20.0, 0.5, Dynamic(**physics_of))
     plan, servo, model = motion.protected_angle_parts.transpose("cause", "time", "protected").values
     size = max(np.abs(motion.protected_angle.values).max(), 1e-9)
-    np.testing.assert_allclose(plan, motion.protected_angle.values, atol=1e-6 * size + 1e-15)
-    assert np.abs(servo).max() < 1e-6 * size + 1e-15
+    np.testing.assert_allclose(plan, motion.protected_angle.values, atol=1e-6 * size + 1e-13)
+    assert np.abs(servo).max() < 1e-6 * size + 1e-13
     assert not model.any()
 
 

