@@ -35,6 +35,9 @@ _HINGE_LIMIT = "1e9"  # rad/s and N m: URDF wants a number, and nothing drives a
 _THIN = 1e-14
 
 
+_LARGEST = 1e9  # of any number of an appendage, SI: beyond it squares and cubes leave floating point
+
+
 @dataclass(frozen=True)
 class Appendage:
     """A solar wing or another flat plate that bends out of its plane.
@@ -117,6 +120,8 @@ class Appendage:
             raise self._error(key, "it must be a number") from None
         if value.shape != ():
             raise self._error(key, "it must be a number")
+        if not abs(value) <= _LARGEST:
+            raise self._error(key, f"it must be finite, and {_LARGEST:g} at most")
         object.__setattr__(self, key, float(value))
         return float(value)
 
@@ -127,6 +132,8 @@ class Appendage:
             values = np.empty(0)
         if values.shape != (3,) or not np.all(np.isfinite(values)):
             raise self._error(key, "it needs 3 finite numbers, base axes")
+        if np.abs(values).max() > _LARGEST:
+            raise self._error(key, f"its numbers must be {_LARGEST:g} at most")
         return values
 
     def _direction(self, key: str) -> Floats:

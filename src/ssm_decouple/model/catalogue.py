@@ -164,8 +164,8 @@ def _appendage(wing: dict[str, Any], count: int) -> Appendage:
         raise ModelError(f"{place}{missing[0]} is missing")
     values = {key: value for key, value in wing.items() if key != "turn_deg"}
     turn = wing.get("turn_deg", 0.0)
-    if not isinstance(turn, int | float) or isinstance(turn, bool):
-        raise ModelError(f"{place}turn_deg is {turn!r}; it must be a number")
+    if not isinstance(turn, int | float) or isinstance(turn, bool) or not abs(turn) <= 360:
+        raise ModelError(f"{place}turn_deg is {turn!r}; it must be a number, of degrees within one turn")
     return Appendage(**values, turn=math.radians(turn))
 
 
