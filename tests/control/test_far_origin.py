@@ -168,7 +168,9 @@ def test_momentum_and_distances_do_not_depend_on_the_place(ets_vii, rng):
         size = np.abs(ets_vii.momentum(q, v)).max()
         np.testing.assert_allclose(ets_vii.momentum(at(q, place), v), ets_vii.momentum(q, v), atol=1e-12 * size)
         here = ets_vii.configuration(START)  # nearest points are found by iteration: to the bit from the same place
-        for one, other in zip(*(Distances(ets_vii, ssm.Clearance(0.05))(x) for x in (here, at(here, place))), strict=True):
+        for one, other in zip(
+            *(Distances(ets_vii, ssm.Clearance(0.05))(x) for x in (here, at(here, place))), strict=True
+        ):
             np.testing.assert_array_equal(one, other)
         law = ssm.SelectiveLaw(ets_vii, ssm.Protection("all"))
         near, far = law.lost_direction(q), law.lost_direction(at(q, place))

@@ -23,7 +23,9 @@ Floats = NDArray[np.float64]
 REVERSAL_SHARE = 0.05
 NOTHING = 1e-6  # of the largest rate of any joint so far: less is rounding
 REVERSALS = 10  # of a joint, from which on they are told
-SETTLED = 1e-9  # relative change in the last pass of planning above which the mean over the hold is not what was planned
+SETTLED = (
+    1e-9  # relative change in the last pass of planning above which the mean over the hold is not what was planned
+)
 TORQUE_SHARE = 1.01  # of a motor's torque: an acceleration limit of the wheel leaves out what the base's own takes
 
 
