@@ -49,7 +49,8 @@ def test_a_protected_rate_that_is_not_kept_is_told_and_no_other(seed, size, node
         found = json.loads(motion.attrs["protection_lost"])
         assert found["largest_rate"] == pytest.approx(rates.max(), rel=1e-12)
         assert sum(end - start for start, end in found["spans"]) == pytest.approx(0.1 * lost[:-1].sum())
-        assert found["why"] and "momentum on board" in told[0]
+        assert found["why"]
+        assert "momentum on board" in told[0]
 
 
 def test_the_command_itself_says_it(ets_vii):
@@ -69,7 +70,9 @@ def test_the_command_itself_says_it(ets_vii):
 def test_limits_that_take_the_protection_are_told(ets_vii):
     q = ets_vii.configuration(START)
     options = {"sample_time": 0.1, "momentum": [0, 0, 0, 0, 0, 20.0], "acceleration_limit": np.deg2rad(0.05)}
-    law = ssm.SelectiveLaw(ets_vii, ssm.Protection("yaw"), limits=ssm.Limits(), joint_weights=[1, 2, 1, 1, 3, 1], **options)
+    law = ssm.SelectiveLaw(
+        ets_vii, ssm.Protection("yaw"), limits=ssm.Limits(), joint_weights=[1, 2, 1, 1, 3, 1], **options
+    )
     motion, told = run(law, q, TARGET, 5.0, method="held")
     found = json.loads(motion.attrs["protection_lost"])
     assert found["why"] == ["the joint rates that it takes exceed position, rate or acceleration limits"]
@@ -80,7 +83,8 @@ def test_limits_that_take_the_protection_are_told(ets_vii):
 def test_a_schedule_tells_of_what_is_on(ets_vii):
     q, schedule = ets_vii.configuration(START), ssm.Schedule([(0.0, "none"), (1.0, "yaw")], hand_over=1.0)
     motion, told = run(ssm.ScheduledLaw(ets_vii, schedule), q, TARGET, 4.0)
-    assert not told and not set(TOLD) & set(motion.attrs)
+    assert not told
+    assert not set(TOLD) & set(motion.attrs)
     assert np.abs(motion.protected_rate).max() > 1e-6  # before it is on
     motion, told = run(ssm.ScheduledLaw(ets_vii, schedule, momentum=[0, 0, 0, 0, 0, 500.0]), q, TARGET, 4.0)
     assert json.loads(motion.attrs["protection_lost"])["spans"] == [[2.0, 4.0]]
@@ -106,9 +110,10 @@ def test_smooth_rates_reverse_nowhere_and_chatter_everywhere(seed):
     smooth += 1e-16 * smooth.max() * rng.normal(size=smooth.shape)
     assert reversals(smooth).sum() == 0
     chatter = smooth.copy()
-    chatter[100:200, 2] += scale[2] * np.where(np.arange(100) % 2, 1.0, -1.0)
+    chatter[100:200, 2] += 5.0 * scale[2] * np.where(np.arange(100) % 2, 1.0, -1.0)
     counts = reversals(chatter).sum(axis=0)
-    assert counts[2] >= 40 and counts.sum() == counts[2]  # half of it where it rides on larger waves
+    assert counts[2] >= 90
+    assert counts.sum() == counts[2]
 
 
 def test_a_rate_vector_that_reverses_is_told_and_damping_settles_it(ets_vii):
@@ -122,7 +127,8 @@ def test_a_rate_vector_that_reverses_is_told_and_damping_settles_it(ets_vii):
         # The batch counts the same motion, up to what chatter makes of rounding.
         found = engine.motions(law, q, TARGET, 120.0, 0.1).rate_reversals[0]
         assert found == pytest.approx(counts[-1], abs=0.2 * counts[-1])
-    assert counts[0] > 100 and counts[1] == 0
+    assert counts[0] > 100
+    assert counts[1] == 0
 
 
 def test_reversals_of_each_row_of_a_batch(ets_vii, rng):
@@ -153,11 +159,13 @@ def test_wheels_that_have_not_the_torque_are_told_and_a_limit_mends_it(ets_vii):
     for name, place in zip(robot.wheel_names, at, strict=True):  # all axes are protected: the base does not turn
         changes = np.diff(motion.joint_rates.values[:, place], prepend=0.0) / 0.1
         assert found[name]["needed"] == pytest.approx(0.1 * np.abs(changes).max(), rel=1e-9)
-        assert found[name]["limit"] == 0.2 and found[name]["spans"][0][0] == 0.0
+        assert found[name]["limit"] == 0.2
+        assert found[name]["spans"][0][0] == 0.0
     assert "45.6 of 0.2 N m" in told[0]
     options = {"sample_time": 0.1, "acceleration_limit": robot.acceleration_limits}
     motion, told = run(ssm.SelectiveLaw(robot, ssm.Protection("all"), gain=0.05, **options), q, TARGET, 150.0)
-    assert not told and motion.attrs["outcome"] == "converged"
+    assert not told
+    assert motion.attrs["outcome"] == "converged"
     assert np.abs(np.diff(motion.joint_rates.values[:, at], axis=0, prepend=0.0)).max() <= 0.2
     assert np.abs(motion.protected_rate).max() < 1e-17
 
@@ -175,6 +183,7 @@ def test_shipped_cases_have_nothing_to_tell_but_one():
 def test_the_command_line_says_it(call, tmp_path):
     done = call("compare", "case1", "--no-figures", "-o", tmp_path)
     lines = [line for line in (done.stdout + done.stderr).splitlines() if "reverse" in line]
-    assert len(lines) == 1 and lines[0].startswith("case1, reactionless: the commanded rates reverse")
+    assert len(lines) == 1
+    assert lines[0].startswith("case1, reactionless: the commanded rates reverse")
     done = call("run", "case1", "--protect", "all", "--no-figures", "-o", tmp_path / "run")
     assert "warning: the commanded rates reverse" in done.stderr.replace("\n", " ")

@@ -286,7 +286,9 @@ class SelectiveLaw(Settled):
 
     Momentum on board, such as what a push or spinning wheels have left, moves the base even while the joints stand
     still. The law takes that off what it asks of the joints: the protected rate stays zero as long as the joints can
-    take the momentum up, and the tasks are met beside it.
+    take the momentum up, and the tasks are met beside it. A command tells by `protection_lost` where they cannot.
+
+    Where the base is far from the inertial origin the law computes in axes through the base.
 
     A law holds Pinocchio's scratch memory: use one law in one thread. Its settings are read when it is made and cannot
     be assigned afterwards, but for `momentum`, which acts.
@@ -296,12 +298,15 @@ class SelectiveLaw(Settled):
         protection: The directions about which the base must not turn.
         gain: Tracking gain k_p, 1/s, of the tasks that name none.
         rate_limit: Largest joint rates, rad/s or m/s: one number, an array (n,), or None for the URDF's.
-        damping: rho at a singularity, m2; 0 gives the Moore-Penrose inverse everywhere.
+        damping: rho at a singularity, m2; 0 gives the Moore-Penrose inverse everywhere. For commands that are held it
+            should be above the sample time times the speed asked for times the arm's length, or rates may reverse from
+            sample to sample there.
         damping_threshold: Smallest singular value, m, below which rho enters.
         sample_time: How long a command is held, s; needed for the two that follow and for `limits`.
         hold_nodes: 0 poses the law at the sample, 1 to 3 on matrices averaged over the hold.
         acceleration_limit: Largest joint accelerations, rad/s2 or m/s2, from one command to the next: one number, an
-            array (n,), or None. The rates are blended from the previous ones within null(J_sub). The protection comes
+            array (n,), or None; `robot.acceleration_limits` is what the motors of reaction wheels can do. The rates are
+            blended from the previous ones within null(J_sub). The protection comes
             first, then the rate limits: where they take more than the acceleration limit allows, it is exceeded and
             the command's `rate_blend` is 0. Without `limits` the law does not brake ahead.
         tasks: What the arm shall do: one task or several; None is the end-effector's position, `PositionTask()`.

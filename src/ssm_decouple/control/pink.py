@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError
 from ssm_decouple.momentum.protection import Protection, checked_protection
+from ssm_decouple.model.origin import from_base
+from ssm_decouple.momentum.protection import Protection
 
 try:
     from pink.tasks import Task
@@ -36,7 +38,7 @@ class ConservedMomentum(Task):  # type: ignore[misc]
     def compute_jacobian(self, configuration: Any) -> Floats:
         """Return the centroidal map A_g (6, nv): [linear; angular] about the centre of mass, inertial axes."""
         model = configuration.model
-        return np.array(pin.computeCentroidalMap(model, model.createData(), configuration.q))
+        return np.array(pin.computeCentroidalMap(model, model.createData(), from_base(configuration.q)))
 
     def __repr__(self) -> str:
         return "ConservedMomentum()"

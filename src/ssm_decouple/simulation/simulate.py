@@ -102,7 +102,12 @@ def simulate(
         end_effector_position, target_position, end_effector_error, smallest_singular_value, rate_scale, rate_blend,
         plan_change, damping, linear_momentum, angular_momentum, centre_of_mass, U_c, robot_urdf. Attributes: `outcome`
         ("converged", "stalled" or "running"), `outcome_time` (s), `final_error` (m), the law's settings, the method
-        and the versions. Of a stalled motion `lost_direction` (JSON) says in which direction the tasks of level 1 could
+        and the versions. What was promised and not kept is told by attributes (JSON) that are there only then, and by a
+        warning each: `protection_lost` (the protected rate is not what was asked for: from when to when, how much,
+        why), `plan_unsettled` (planning for the hold has not settled), `rate_reversals` (joints whose commanded rates
+        alternate from sample to sample) and, of kinematic motions, `wheel_torque_exceeded` (wheels that would need
+        more torque than their motors have). Of a stalled motion
+        `lost_direction` (JSON) says in which direction the tasks of level 1 could
         move least at its end, and how much better that would be without each protected row. With other tasks
         than the end-effector's position there is also `task_error` (time, task_row), m or rad, as the law sees
         it, each row with its name and `task_level`; where no task asks for a position of the end-effector, its
@@ -119,6 +124,9 @@ def simulate(
         SimulationInterrupted: Ctrl-C; it is a KeyboardInterrupt and carries the motion so far.
         Exception: whatever a function of yours raises (target, protected_rate, progress, that of a schedule) comes
             through as it is. An error in the middle of the motion carries the motion so far as its attribute `motion`.
+
+    Warns:
+        DecoupleWarning: the target is out of reach, or a promise was not kept.
     """
     as_kind("law", law, SelectiveLaw, "give a law, such as SelectiveLaw(robot, Protection('yaw'))")
     time = sample_times(duration, dt, record_bytes(law))
