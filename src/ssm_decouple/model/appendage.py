@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.errors import InputError
+from ssm_decouple.model.inspection import inspect_urdf
 from ssm_decouple.model.urdf import (
     Body,
     Finding,
-    inspect_urdf,
     parted_urdf,
     refuse_twins,
     remaining_body,

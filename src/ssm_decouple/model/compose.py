@@ -13,6 +13,9 @@ from numpy.typing import ArrayLike
 from ssm_decouple.errors import ModelError, as_floats
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.catalogue import describe
+from ssm_decouple.model.grammar import inspect_grammar
+from ssm_decouple.model.inspection import inspect_tree, refuse_impossible
+from ssm_decouple.model.plain import make_plain
 from ssm_decouple.model.robot import Robot, rigid_pose
 from ssm_decouple.model.urdf import parse_urdf, read_urdf, root_link, tip_links, triple
 
@@ -57,7 +60,7 @@ def compose(
             f"arm '{arm_name}' has the appendages {', '.join(wing.name for wing in lost)}, which would leave the root "
             "link; give them to the whole with compose(..).with_appendages([..])"
         )
-    whole, part = parse_urdf(bus_text, bus_name), parse_urdf(arm_text, arm_name)
+    whole, part = _plain(bus_text, bus_name), _plain(arm_text, arm_name)
     carrier = mount_link or root_link(whole)
     links = [link.get("name") for link in whole.findall("link")]
     if carrier not in links:
@@ -85,6 +88,14 @@ def _parts(source: str | Path | Robot) -> tuple[str, str, str | None, tuple[Appe
         return source.urdf, source.name, source.end_effector, source.appendages
     found = describe(source)
     return read_urdf(found.urdf), found.name, found.end_effector, found.appendages
+
+
+def _plain(text: str, name: str) -> ET.Element:
+    """Return a part in plain form: what is merged is what is read of it."""
+    root = parse_urdf(text, name)
+    refuse_impossible(name, [*inspect_tree(root), *inspect_grammar(root)])
+    make_plain(root)
+    return root
 
 
 def _tool(part: ET.Element, arm_name: str, wanted: str | None, known: str | None) -> str:

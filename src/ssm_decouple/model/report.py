@@ -10,7 +10,8 @@ import numpy as np
 
 from ssm_decouple.errors import DecoupleError
 from ssm_decouple.model.appendage import inspect_remaining_bus, remaining_bus
-from ssm_decouple.model.urdf import Finding, inspect_urdf, parse_urdf, read_urdf, root_link, tip_links
+from ssm_decouple.model.inspection import inspect_urdf
+from ssm_decouple.model.urdf import Finding, parse_urdf, read_urdf, root_link, tip_links
 
 if TYPE_CHECKING:
     from ssm_decouple.model.robot import Robot
@@ -186,7 +187,7 @@ class Report:
             tips=tuple(tip_links(root)),
             frames=tuple(robot.link_names),
             joints=tuple(joints),
-            findings=(*inspect_urdf(root), *inspect_remaining_bus(root, robot.appendages)),
+            findings=(*robot.findings, *inspect_remaining_bus(root, robot.appendages)),
             flexible=FlexibleReport.of_robot(robot) if robot.appendages else None,
         )
 

@@ -14,9 +14,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, as_floats
 from ssm_decouple.model.appendage import Appendage, Modes, checked_appendages, inspect_remaining_bus
+from ssm_decouple.model.inspection import inspect_urdf, refuse_impossible
 from ssm_decouple.model.locked import locked_urdf
 from ssm_decouple.model.payload import loaded_urdf, payload_body
-from ssm_decouple.model.urdf import inspect_urdf, parse_urdf, root_link, tip_links
+from ssm_decouple.model.plain import pinocchio_model, plain_urdf
+from ssm_decouple.model.reading import UNLIMITED as UNLIMITED
+from ssm_decouple.model.urdf import Finding, parse_urdf, root_link, tip_links
+from ssm_decouple.model.verify import refuse_other_numbers
 from ssm_decouple.model.wheels import Wheel, wheel_axes, wheeled_urdf
 
 if TYPE_CHECKING:
@@ -24,7 +28,8 @@ if TYPE_CHECKING:
     from ssm_decouple.momentum.coupling import Coupling
 
 Floats = NDArray[np.float64]
-UNLIMITED = 1e300  # Pinocchio writes the largest double where a URDF gives no limit
+
+_FRAMES = (pin.FrameType.BODY, pin.FrameType.OP_FRAME, pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT)
 
 
 class Robot:
@@ -43,7 +48,8 @@ class Robot:
             holds. The robot itself stays rigid; `Plant.of(robot)` is the one that bends.
 
     Attributes:
-        urdf: The URDF text.
+        urdf: The URDF text; as given, or in plain form where other readers would read it otherwise or not at all.
+        findings: All that is suspicious in it or worth a note.
         name: As given.
         model: The `pinocchio.Model`.
         n_joints: Number n of joints after the root.
@@ -53,7 +59,7 @@ class Robot:
         end_effector: Name of the end-effector's frame; the root link where there is no joint.
         end_effector_id: Its Pinocchio frame index.
         rate_limits: Joint rate limits (n,) from the URDF, rad/s or m/s; inf where it gives none.
-        position_limits: Lower and upper joint limits (n, 2), rad or m; infinite for continuous joints.
+        position_limits: Lower and upper joint limits (n, 2), rad or m; infinite where there is none.
         mass: Total mass, kg.
         appendages: As given, a tuple.
 
@@ -67,24 +73,17 @@ class Robot:
         self, urdf: str, *, name: str, end_effector: str | None = None, appendages: Iterable[Appendage] = ()
     ) -> None:
         root = parse_urdf(urdf, name)
-        findings = inspect_urdf(root)
-        impossible = [finding for finding in findings if finding.level == "impossible"]
-        if impossible:
-            more = f" (and {len(impossible) - 1} more: `ssm-decouple check` lists them)" if impossible[1:] else ""
-            raise ModelError(f"robot '{name}': {impossible[0]}{more}")
-        inertias = [finding for finding in findings if "principal moment" in finding.message]
-        if inertias:
-            listed = "; ".join(str(finding) for finding in inertias)
-            warnings.warn(f"robot '{name}': no solid body has such an inertia: {listed}", DecoupleWarning, stacklevel=3)
-
-        self.urdf = urdf
+        self.findings: tuple[Finding, ...] = tuple(inspect_urdf(root))
+        refuse_impossible(name, self.findings)
+        self._warn(name)
         self.name = name
+        self.urdf, reading = plain_urdf(root, urdf)
         try:
-            self.model: pin.Model = pin.buildModelFromXML(urdf, pin.JointModelFreeFlyer())
-        except (ValueError, RuntimeError) as error:
-            raise ModelError(f"robot '{name}': Pinocchio cannot read it: {error}") from error
+            self.model: pin.Model = pinocchio_model(root)
+            refuse_other_numbers(self.model, reading)
+        except ModelError as error:
+            raise ModelError(f"robot '{name}': {error}") from error
         self.model.gravity.setZero()  # Pinocchio's own default would be in whatever a user computes with the model
-        self._refuse_lost_mass(root)
         self._data: pin.Data = self.model.createData()
         self._neutral: Floats = pin.neutral(self.model)
         self.n_joints: int = self.model.nv - 6
@@ -100,6 +99,14 @@ class Robot:
         self.position_limits: Floats = self._read_position_limits()
         self._refuse_singular_inertia()
         self.appendages: tuple[Appendage, ...] = self._fitting(appendages)
+
+    def _warn(self, name: str) -> None:
+        """Warn of what probably is not as the file means it."""
+        kinds = {"principal moment": "no solid body has such an inertia", "<mimic>": "it has joints that mimic others"}
+        for words, told in kinds.items():
+            listed = "; ".join(str(finding) for finding in self.findings if words in finding.message)
+            if listed:
+                warnings.warn(f"robot '{name}': {told}: {listed}", DecoupleWarning, stacklevel=4)
 
     def with_appendages(self, appendages: Iterable[Appendage]) -> Robot:
         """Return this robot with these appendages on its root link, instead of any that it has.
@@ -193,6 +200,8 @@ class Robot:
     def _fitting(self, appendages: Iterable[Appendage]) -> tuple[Appendage, ...]:
         try:
             found = checked_appendages(appendages)
+            if not found:
+                return found
             strange = inspect_remaining_bus(parse_urdf(self.urdf, self.name), found)
         except (InputError, ModelError) as error:
             raise type(error)(f"robot '{self.name}': {error}") from error
@@ -219,17 +228,19 @@ class Robot:
 
     def _choose_end_effector(self, wanted: str | None, tips: list[str], root: str) -> str:
         frames = self.link_names
+        left_out = "".join(f"; {finding}" for finding in self.findings if "left out" in finding.message)
         if wanted is None:
             if "end_effector" in frames:
                 return "end_effector"
             if len(tips) > 1:
                 raise ModelError(
-                    f"robot '{self.name}' has {len(tips)} tips: name one as end_effector: {', '.join(tips)}"
+                    f"robot '{self.name}' has {len(tips)} tips: name one as end_effector: {', '.join(tips)}{left_out}"
                 )
             return tips[0] if tips else root
-        if not self.model.existFrame(wanted):
+        if not self._has_frame(wanted):
             raise ModelError(
                 f"robot '{self.name}' has no frame '{wanted}' for its end-effector; it has {', '.join(frames)}"
+                f"{left_out}"
             )
         return wanted
 
@@ -238,24 +249,21 @@ class Robot:
         for i, joint in enumerate(self.model.joints[2:]):
             if joint.nq == 1:
                 limits[i] = self.model.lowerPositionLimit[joint.idx_q], self.model.upperPositionLimit[joint.idx_q]
-        return limits
+        return np.where(np.abs(limits) < UNLIMITED, limits, np.copysign(np.inf, limits))
+
+    def _has_frame(self, name: str) -> bool:
+        try:
+            return self.frame_id(name) > 0
+        except InputError:
+            return False
 
     def frame_id(self, name: str) -> int:
         """Return the index of a link's frame, else of any other; a joint and a link may share a name."""
-        for kinds in (pin.FrameType.BODY, pin.FrameType.OP_FRAME, pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT):
-            if self.model.existFrame(name, kinds):
-                return int(self.model.getFrameId(name, kinds))
+        for kinds in _FRAMES:
+            index = int(self.model.getFrameId(name, kinds)) if self.model.existFrame(name, kinds) else 0
+            if index:  # the first is Pinocchio's own world, which is no part of the robot
+                return index
         raise InputError(f"'{self.name}' has no frame '{name}'; its links are {', '.join(self.link_names)}")
-
-    def _refuse_lost_mass(self, root: ET.Element) -> None:
-        """Pinocchio drops an inertia that it cannot read without a word; its sum tells."""
-        written = sum(float(mass.get("value", "0")) for mass in root.findall("link/inertial/mass"))
-        read = float(pin.computeTotalMass(self.model))
-        if abs(read - written) > 1e-9 * written:
-            raise ModelError(
-                f"robot '{self.name}': its links weigh {written:g} kg but Pinocchio reads {read:g} kg of them; an "
-                "<inertial> is malformed"
-            )
 
     def _refuse_singular_inertia(self) -> None:
         pin.computeCentroidalMap(self.model, self._data, self._neutral)
