@@ -13,7 +13,9 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError, ModelError, as_not_negative, as_positive
+from ssm_decouple.model.plain import parser_heard, pinocchio_text
 from ssm_decouple.model.robot import Robot
+from ssm_decouple.model.urdf import parse_urdf
 
 Floats = NDArray[np.float64]
 Pair = tuple[str, str]
@@ -275,10 +277,13 @@ def _rates(J: Floats, normals: Floats, points: Floats, carried: Floats) -> Float
 
 
 def _geometry(robot: Robot) -> pin.GeometryModel:
+    text = pinocchio_text(parse_urdf(robot.urdf, robot.name), shapes="collision")
+    said: list[str] = []
     try:
-        geometry = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
+        with parser_heard(said):
+            geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.COLLISION)
     except (ValueError, RuntimeError) as error:
-        why = " ".join(str(error).split())
+        why = "; ".join([*said, " ".join(str(error).split())])
         raise ModelError(
             f"robot '{robot.name}': a collision shape cannot be read; give its mesh a full path, or name the folder of "
             f"its package in ROS_PACKAGE_PATH: {why}"

@@ -157,8 +157,9 @@ def _inspect_limit(joint: ET.Element, where: str, kind: str, limit: ET.Element) 
         message = "no velocity limit above zero" if limits.velocity <= 0 else "its <limit> gives no velocity limit"
         yield Finding("suspicious", where, f"{message}: give the law a rate_limit")
     if not 0 <= limits.effort < np.inf:
-        message = "is negative, and not kept" if limits.effort < 0 else "limit: none is given"
-        yield Finding("suspicious" if limits.effort < 0 else "note", where, f"its effort {message}")
+        negative = limits.effort < 0
+        message = f"its effort limit {limits.effort:g} is negative and means none" if negative else "no effort limit"
+        yield Finding("suspicious" if negative else "note", where, message)
     if kind != "prismatic":
         yield from _inspect_degrees(joint, where, limits)
 

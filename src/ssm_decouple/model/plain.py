@@ -9,7 +9,7 @@ import tempfile
 import threading
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import lru_cache
 from xml.sax.saxutils import quoteattr
 
@@ -52,6 +52,10 @@ def plain_urdf(root: ET.Element, text: str) -> tuple[str, Reading]:
 def make_plain(root: ET.Element) -> bool:
     """Bring a URDF into plain form, in place; return whether anything had to be changed. See `plain_urdf`."""
     changes = [_without(root, world_above(root)), _without(root, _materials_again(root))]
+    if (
+        root.get("version", "1.0") != "1.0"
+    ):  # later ones only add quaternions, which are gone, and few readers know them
+        changes += [root.attrib.pop("version") != "1.0"]
     for link in root.findall("link"):
         inertial = link.find("inertial")
         shapes = [*link.findall("visual"), *link.findall("collision")]
@@ -245,6 +249,14 @@ def pinocchio_model(root: ET.Element) -> pin.Model:
     if said:
         print(*said, sep="\n", file=sys.stderr)  # it may be another thread's, and nothing is to be lost
     return model
+
+
+def said_of(text: str) -> list[str]:
+    """Return what Pinocchio's parser complains of in URDF text, figures and all, each complaint once."""
+    said: list[str] = []
+    with parser_heard(said), suppress(ValueError, RuntimeError):
+        pin.buildModelFromXML(text)
+    return list(dict.fromkeys(said))
 
 
 _hearing = threading.Lock()

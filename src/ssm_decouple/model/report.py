@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ import numpy as np
 from ssm_decouple.errors import DecoupleError
 from ssm_decouple.model.appendage import inspect_remaining_bus, remaining_bus
 from ssm_decouple.model.inspection import inspect_urdf
+from ssm_decouple.model.plain import said_of
 from ssm_decouple.model.urdf import Finding, parse_urdf, read_urdf, root_link, tip_links
 
 if TYPE_CHECKING:
@@ -156,7 +157,9 @@ class Report:
             robot = Robot(text, name=name, end_effector=tool, appendages=described.appendages)
         except DecoupleError as error:
             return cls._unusable(name, [*findings, Finding("impossible", "robot", str(error))])
-        return cls._of_loaded(robot, None if ambiguous else robot.end_effector)
+        report = cls._of_loaded(robot, None if ambiguous else robot.end_effector)
+        heard = [Finding("suspicious", "file", f"other readers of URDF say: {line}") for line in said_of(robot.urdf)]
+        return replace(report, findings=(*report.findings, *heard))
 
     @classmethod
     def _unusable(cls, name: str, findings: list[Finding]) -> Report:

@@ -372,7 +372,10 @@ class Robot:
 
     @property
     def reach(self) -> float:
-        """Distance, m, from the arm's first joint to the end-effector if the arm could be pulled straight."""
+        """Distance, m, from the arm's first joint to the end-effector if the arm could be pulled straight.
+
+        It is infinite where a joint slides without limits.
+        """
         frame = self.model.frames[self.end_effector_id]
         length = float(np.linalg.norm(frame.placement.translation))
         chain = [joint for joint in self.model.supports[frame.parentJoint] if joint > 1]

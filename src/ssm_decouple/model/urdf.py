@@ -71,8 +71,12 @@ def parse_urdf(text: str, source: str) -> ET.Element:
     """Return the <robot> element of URDF text.
 
     Raises:
-        ModelError: not XML, not a URDF, or still a xacro.
+        ModelError: not text, not XML, not a URDF, or still a xacro.
     """
+    if not isinstance(text, str):
+        raise ModelError(
+            f"'{source}' is no URDF text but {type(text).__name__}; a file is loaded with load_robot(path)"
+        )
     try:
         root = ET.fromstring(text.removeprefix("\ufeff"))
     except (ET.ParseError, ValueError) as error:

@@ -106,8 +106,11 @@ class Grid:
         """Return cubes of a size, reach / 20 if none is given, with the arm's first joint in the middle of one.
 
         Raises:
-            InputError: the size is not positive, or so small that there are more than `VOXELS` cubes.
+            InputError: the size is not positive, or so small that there are more than `VOXELS` cubes; or the arm's
+                reach has no end.
         """
+        if not np.isfinite(robot.reach):
+            raise InputError(f"'{robot.name}' reaches without end: a joint slides without limits; give it limits")
         size = as_positive("voxel", robot.reach / PER_REACH if edge is None else edge)
         half = int(np.ceil(robot.reach / size))
         count = 2 * half + 1

@@ -26,7 +26,7 @@ from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.motion import judge
 from ssm_decouple.studies.case import Case, cases, load_case
 from ssm_decouple.viewing.viewer.page import Page
-from ssm_decouple.viewing.viewer.parts import Part, antenna, spacecraft_parts
+from ssm_decouple.viewing.viewer.parts import Part, antenna, drawn_reach, spacecraft_parts
 from ssm_decouple.viewing.viewer.plots import AXES, FLOOR, HEIGHT, POINTS, caption
 from ssm_decouple.viewing.viewer.scene import Vectors, body_poses, rotated, split_rate
 from ssm_decouple.viewing.viewer.server import HOST, PORT
@@ -186,7 +186,7 @@ class Live(Page):
         for i, part in enumerate(parts):
             body = self.joints.index(part.joint)
             add_part(self.server, f"/spacecraft/body_{body}/{part.name or 'part'}_{i}", part)
-        self.size = max(2.0 * self.robot.reach, _width(parts))
+        self.size = max(2.0 * drawn_reach(self.robot), _width(parts))
         found = antenna(parts)
         if found is not None:
             line, name = sight_line(found[1], self.size), "/spacecraft/body_0/line_of_sight"
@@ -194,7 +194,7 @@ class Live(Page):
         self.arrows = Arrows(self.server, "/spacecraft", self.size, parts)
         self._largest = USUAL * self._fastest_joint()
         self._protected: str | None = None
-        reach, place = self.robot.reach, self.robot.shoulder_position(q)
+        reach, place = drawn_reach(self.robot), self.robot.shoulder_position(q)
         start = self.target.translation if self.posed else self.target
         self.handle = scene.add_transform_controls(
             "/target",
