@@ -116,7 +116,7 @@ def _stray(element: ET.Element, where: str) -> Iterator[tuple[str, str]]:
 
 def _short(text: str) -> str:
     words = " ".join(text.split())
-    return words if len(words) <= 40 else words[:37] + "..."
+    return words if len(words) <= 60 else words[:57] + "..."
 
 
 @lru_cache(maxsize=1024)
@@ -152,7 +152,7 @@ def _joint_numbers(joint: ET.Element, where: str) -> Iterator[tuple[str, str]]:
     given = "1 0 0" if axis is None else axis.get("xyz", "")
     values = _finite(given, 3)
     if values is None or not any(values):
-        yield where, f'<axis xyz="{given}"> needs 3 finite numbers, not all zero'
+        yield where, f'<axis xyz="{_short(given)}"> needs 3 finite numbers, not all zero'
     for tag in ("limit", "dynamics"):
         element = joint.find(tag)
         for key in () if element is None else ATTRIBUTES[tag]:
@@ -165,13 +165,13 @@ def _unreadable(where: str, tag: str, key: str, given: str, finite: bool = False
     try:
         value = number(given)
     except ValueError as error:
-        yield where, f'<{tag} {key}="{given}"> is malformed: {error}'
+        yield where, f'<{tag} {key}="{_short(given)}"> is malformed: {error}'
         return
     endless = {"lower": math.inf, "upper": -math.inf, "effort": -math.inf, "velocity": -math.inf}
     if tag != "mass" and tag != "inertia" and (math.isnan(value) or value == endless.get(key)):
-        yield where, f'<{tag} {key}="{given}"> needs a number'
+        yield where, f'<{tag} {key}="{_short(given)}"> needs a number'
     elif finite and not math.isfinite(value):
-        yield where, f'<{tag} {key}="{given}"> needs a finite number'
+        yield where, f'<{tag} {key}="{_short(given)}"> needs a finite number'
 
 
 def _origin_numbers(element: ET.Element, where: str) -> Iterator[tuple[str, str]]:
@@ -187,12 +187,13 @@ def origin_faults(origin: ET.Element) -> Iterator[str]:
             continue
         values = _finite(given, size)
         if values is None:
-            yield f'<origin {key}="{given}"> needs {size} finite numbers'
+            yield f'<origin {key}="{_short(given)}"> needs {size} finite numbers'
         elif key == "quat_xyzw":
             if origin.get("rpy") is not None:
                 yield "<origin> has both rpy and quat_xyzw; keep one"
-            if abs(math.hypot(*values) - 1) > 1e-3:
-                yield f'<origin quat_xyzw="{given}"> has length {math.hypot(*values):.6g}; a rotation needs length 1'
+            length = math.hypot(*values)
+            if abs(length - 1) > 1e-3:
+                yield f'<origin quat_xyzw="{_short(given)}"> has length {length:.6g}; a rotation needs length 1'
 
 
 def _finite(text: str, size: int) -> tuple[float, ...] | None:

@@ -37,7 +37,7 @@ class Finding:
     message: str
 
     def __str__(self) -> str:
-        return f"{self.where}: {self.message}"
+        return " ".join(f"{self.where}: {self.message}".split())  # on one line, whatever is quoted
 
 
 def read_urdf(path: str | Path) -> str:
