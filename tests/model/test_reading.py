@@ -275,6 +275,8 @@ def test_a_mimic_joint_is_told_on_loading(write):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert robot.with_locked({"follower": 0.1}).joint_names == ("elbow",)
+        for other in (robot.with_payload(1.0, [0, 0, 0], np.eye(3)), ssm.perturbed(robot, ssm.Tolerances(mass=0.1), 1)):
+            assert other.n_joints == 2
 
 
 WORLD = '<link name="world"/><joint name="free" type="floating"><parent link="world"/><child link="bus"/></joint>'
@@ -449,6 +451,23 @@ def test_a_long_row_of_fixed_joints_loads():
         parent = f"l{i}"
     robot = ssm.Robot(arm(extra="".join(rows)), name="long")
     assert robot.mass == 102 + count
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        arm().replace('xyz="0.5 0 0"', 'xyz="1e200 0 0"'),
+        arm().replace('ixx=".1"', 'ixx="1e308" ixy="1e308"').replace(' ixy="0" ixz="0" iyy=".1"', ' ixz="0" iyy=".1"'),
+    ],
+)
+def test_numbers_beyond_all_use_are_refused(text):
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            robot = ssm.Robot(text, name="r")
+        except ssm.ModelError:
+            return
+    assert np.all(np.isfinite(robot.coupling(robot.configuration()).H_ww))
 
 
 def test_plain_urdf_reads_before_it_writes():

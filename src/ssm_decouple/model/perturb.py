@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError, as_floats, as_seed
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.model.robot import Robot, mimics_told
 from ssm_decouple.model.urdf import parse_urdf, root_link
 
 Floats = NDArray[np.float64]
@@ -76,12 +76,13 @@ def perturbed(robot: Robot, tolerances: Tolerances, seed: int | np.random.Genera
             parent = joint.find("parent")
             if parent is not None and (parent.get("link") == base) is on_base:
                 _shift(joint, tolerance * rng.uniform(-1, 1, 3))
-    return Robot(
-        ET.tostring(root, encoding="unicode"),
-        name=f"{robot.name} (perturbed)",
-        end_effector=robot.end_effector,
-        appendages=robot.appendages,
-    )
+    with mimics_told():
+        return Robot(
+            ET.tostring(root, encoding="unicode"),
+            name=f"{robot.name} (perturbed)",
+            end_effector=robot.end_effector,
+            appendages=robot.appendages,
+        )
 
 
 def _disturb_body(inertial: ET.Element, tolerances: Tolerances, rng: np.random.Generator) -> None:

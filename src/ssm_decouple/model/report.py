@@ -243,6 +243,8 @@ def _quantity(value: float, kind: str, per: str = "") -> str:
 
 
 def _limits(joint: JointReport) -> str:
-    if not np.isfinite(joint.lower):
+    if joint.type == "continuous":
         return "turns without end"
+    if not (np.isfinite(joint.lower) or np.isfinite(joint.upper)):
+        return "no position limits"
     return f"{_quantity(joint.lower, joint.type).split()[0]} to {_quantity(joint.upper, joint.type)}"

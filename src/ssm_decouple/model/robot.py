@@ -5,7 +5,8 @@ from __future__ import annotations
 import copy
 import warnings
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
+_MIMICS = "it has joints that mimic others"
 _FRAMES = (pin.FrameType.BODY, pin.FrameType.OP_FRAME, pin.FrameType.JOINT, pin.FrameType.FIXED_JOINT)
 
 
@@ -102,7 +104,7 @@ class Robot:
 
     def _warn(self, name: str) -> None:
         """Warn of what probably is not as the file means it."""
-        kinds = {"principal moment": "no solid body has such an inertia", "<mimic>": "it has joints that mimic others"}
+        kinds = {"principal moment": "no solid body has such an inertia", "<mimic>": _MIMICS}
         for words, told in kinds.items():
             listed = "; ".join(str(finding) for finding in self.findings if words in finding.message)
             if listed:
@@ -168,7 +170,8 @@ class Robot:
         except (InputError, ModelError) as error:
             raise type(error)(f"robot '{self.name}': {error}") from error
         text, name = ET.tostring(whole, encoding="unicode"), f"{self.name} + wheels"
-        return Robot(text, name=name, end_effector=self.end_effector, appendages=self.appendages)
+        with mimics_told():
+            return Robot(text, name=name, end_effector=self.end_effector, appendages=self.appendages)
 
     def with_locked(self, joints: Mapping[str, float]) -> Robot:
         """Return this robot with joints fixed where they stand: failed, braked, or not to be used.
@@ -267,7 +270,10 @@ class Robot:
 
     def _refuse_singular_inertia(self) -> None:
         pin.computeCentroidalMap(self.model, self._data, self._neutral)
-        smallest, *_, largest = np.linalg.eigvalsh(np.array(self._data.Ag[3:, 3:6]))
+        whole = np.array(self._data.Ag[3:, 3:6])
+        if not np.all(np.isfinite(whole)):
+            raise ModelError(f"robot '{self.name}': the whole has no finite inertia; its links' numbers are too large")
+        smallest, *_, largest = np.linalg.eigvalsh(whole)
         if not smallest > 1e-12 * largest:
             raise ModelError(
                 f"robot '{self.name}': the whole has no rotational inertia about some axis (principal moments "
@@ -430,6 +436,14 @@ class Robot:
         from ssm_decouple.model.report import Report
 
         return Report.of_robot(self)
+
+
+@contextmanager
+def mimics_told() -> Iterator[None]:
+    """Build a robot from another one, which has told of its mimic joints."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", f".*{_MIMICS}", DecoupleWarning)
+        yield
 
 
 def rigid_pose(name: str, pose: pin.SE3 | ArrayLike) -> pin.SE3:
