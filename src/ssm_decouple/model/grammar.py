@@ -19,11 +19,10 @@ _ONCE = {
     "joint": ("parent", "child", "origin", "axis", "limit", "dynamics", "mimic"),
 }
 _OTHERS = {"link": ("visual", "collision"), "inertial": (), "joint": ("safety_controller", "calibration", "wheel")}
-_TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 ATTRIBUTES = {
     "origin": ("xyz", "rpy", "quat_xyzw"),
     "mass": ("value",),
-    "inertia": _TENSOR,
+    "inertia": ("ixx", "ixy", "ixz", "iyy", "iyz", "izz"),
     "axis": ("xyz",),
     "limit": ("lower", "upper", "effort", "velocity"),
     "dynamics": ("damping", "friction"),
@@ -128,7 +127,7 @@ def _meant(word: str, known: tuple[str, ...]) -> str | None:
 
 def _inertial_numbers(inertial: ET.Element, where: str) -> Iterator[tuple[str, str]]:
     yield from _origin_numbers(inertial, where)
-    for tag, keys in (("mass", ("value",)), ("inertia", _TENSOR)):
+    for tag, keys in (("mass", ("value",)), ("inertia", ATTRIBUTES["inertia"])):
         element = inertial.find(tag)
         for key in keys:
             given = None if element is None else element.get(key)

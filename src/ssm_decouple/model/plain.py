@@ -19,16 +19,14 @@ import pinocchio as pin
 from ssm_decouple.errors import ModelError
 from ssm_decouple.model.grammar import ATTRIBUTES, MOVING, origin_faults
 from ssm_decouple.model.reading import JointLimits, Reading, rotations, unit_axis
-from ssm_decouple.model.urdf import number, numbers, triple
+from ssm_decouple.model.urdf import joint_end, number, numbers, triple
 
-# Numbers that all readers take alike; of a vector they are apart by blanks. What XML itself has beyond elements and
-# comments, and other encodings than the usual one, is left to our own parser too.
+# Numbers that all readers take alike; of a vector they are apart by blanks.
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,3})?"
 _NUMBERS = re.compile(rf"{_NUMBER}(?: +{_NUMBER})*", re.ASCII)
-_UNUSUAL = re.compile(r"<!(?!--)|\sxmlns\s*=|^\ufeff|<\?xml[^>]*encoding\s*=\s*[\"'](?!utf-8)", re.IGNORECASE)
+_OTHER_ENCODING = re.compile(r"<\?xml[^>]*encoding\s*=\s*[\"'](?!utf-8)", re.IGNORECASE)
 
 _MOST = repr(float(np.finfo(float).max))  # what Pinocchio itself writes for no limit
-_TENSOR = ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
 
 
 def plain_urdf(root: ET.Element, text: str) -> tuple[str, Reading]:
@@ -46,7 +44,13 @@ def plain_urdf(root: ET.Element, text: str) -> tuple[str, Reading]:
     dropped = _without(root, world_above(root))
     reading = Reading.of(root)
     changed = make_plain(root) or dropped
-    return ET.tostring(root, encoding="unicode") if changed or _UNUSUAL.search(text) else text, reading
+    return ET.tostring(root, encoding="unicode") if changed or _is_unusual(text) else text, reading
+
+
+def _is_unusual(text: str) -> bool:
+    """Say whether a text has what few readers of URDF know of XML: more than elements and comments, other encodings."""
+    declares = text.count("<!") != text.count("<!--")
+    return declares or "xmlns" in text or text.startswith("\ufeff") or _OTHER_ENCODING.match(text) is not None
 
 
 def make_plain(root: ET.Element) -> bool:
@@ -62,7 +66,7 @@ def make_plain(root: ET.Element) -> bool:
         changes += [_plain_origin(element) for element in ([] if inertial is None else [inertial])]
         if inertial is not None:
             changes += [_plain_numbers(inertial.find("mass"), ("value",))]
-            changes += [_plain_numbers(inertial.find("inertia"), _TENSOR)]
+            changes += [_plain_numbers(inertial.find("inertia"), ATTRIBUTES["inertia"])]
         for shape in shapes:
             changes.append(_without(link, [shape]) if malformed(shape) else _plain_origin(shape))
     for joint in root.findall("joint"):
@@ -85,14 +89,14 @@ def world_above(root: ET.Element) -> list[ET.Element]:
     floats: such links, which have no mass and are fixed to each other, are no part of it, nor is the floating joint.
     Nothing is returned where the floating joint is anything else.
     """
-    joints = {_end(joint, "child"): joint for joint in root.findall("joint")}
+    joints = {joint_end(joint, "child"): joint for joint in root.findall("joint")}
     floating = [joint for joint in joints.values() if joint.get("type") == "floating"]
     if len(floating) != 1:
         return []
-    start = _end(floating[0], "child")
+    start = joint_end(floating[0], "child")
     below: dict[str, list[str]] = {}
     for child, joint in joints.items():
-        below.setdefault(_end(joint, "parent"), []).append(child)
+        below.setdefault(joint_end(joint, "parent"), []).append(child)
     robot = [start]
     for name in robot:  # grows while it is walked
         robot += below.get(name, [])
@@ -104,13 +108,8 @@ def world_above(root: ET.Element) -> list[ET.Element]:
     return [*links, *above, floating[0]]
 
 
-def _end(joint: ET.Element, role: str) -> str:
-    element = joint.find(role)
-    return "" if element is None else element.get("link", "")
-
-
 def _weighs(link: ET.Element) -> bool:
-    values = [("mass", "value"), *(("inertia", key) for key in _TENSOR)]
+    values = [("mass", "value"), *(("inertia", key) for key in ATTRIBUTES["inertia"])]
     found = [(link.find(f"inertial/{tag}"), key) for tag, key in values]
     return any(number(element.get(key, "0")) != 0 for element, key in found if element is not None)
 
@@ -204,7 +203,10 @@ def pinocchio_text(root: ET.Element, shapes: str | None = None) -> str:
     for element in root:
         if element.tag == "link":
             inertial = element.find("inertial")
-            body = "" if inertial is None else f"<inertial>{''.join(map(_written, inertial))}</inertial>"
+            body = ""
+            if inertial is not None:
+                numbers_read = "".join(_written(child) for child in inertial if child.tag in _OF_AN_INERTIAL)
+                body = f"<inertial>{numbers_read}</inertial>"
             kept = [ET.tostring(shape, encoding="unicode") for shape in element.findall(shapes)] if shapes else []
             parts.append(f"<link name={_quoted(element.get('name', ''))}>{body}{''.join(kept)}</link>")
         elif element.tag == "joint":
@@ -215,6 +217,7 @@ def pinocchio_text(root: ET.Element, shapes: str | None = None) -> str:
     return "".join([*parts, "</robot>"])
 
 
+_OF_AN_INERTIAL = ("origin", "mass", "inertia")
 _OF_A_JOINT = ("parent", "child", "origin", "axis", "limit", "dynamics")
 
 

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_decouple.model.grammar import MOVING
-from ssm_decouple.model.urdf import floats, number, numbers
+from ssm_decouple.model.grammar import ATTRIBUTES, MOVING
+from ssm_decouple.model.urdf import floats, joint_end, number, numbers
 
 Floats = NDArray[np.float64]
 
@@ -42,7 +42,11 @@ class JointLimits:
         zero, as URDF says; with neither it has no position limits.
         """
         limit = joint.find("limit")
-        given = {} if limit is None else {key: number(text) for key, text in limit.attrib.items() if key in _LIMITS}
+        given = (
+            {}
+            if limit is None
+            else {key: number(text) for key, text in limit.attrib.items() if key in ATTRIBUTES["limit"]}
+        )
         free = joint.get("type") == "continuous" or not ("lower" in given or "upper" in given)
         return cls(
             lower=-np.inf if free else _endless(given.get("lower", 0.0)),
@@ -50,9 +54,6 @@ class JointLimits:
             effort=_endless(given.get("effort", np.inf)),
             velocity=_endless(given.get("velocity", np.inf)),
         )
-
-
-_LIMITS = ("lower", "upper", "effort", "velocity")
 
 
 def _endless(value: float) -> float:
@@ -80,18 +81,13 @@ class JointReading:
         return cls(
             name=joint.get("name", ""),
             kind=kind,
-            parent=_end(joint, "parent"),
-            child=_end(joint, "child"),
+            parent=joint_end(joint, "parent"),
+            child=joint_end(joint, "child"),
             axis=unit_axis(joint) if moves else np.zeros(3),
             limits=JointLimits.of(joint) if moves else JointLimits(-np.inf, np.inf, np.inf, np.inf),
             damping=0.0 if dynamics is None else number(dynamics.get("damping", "0")),
             friction=0.0 if dynamics is None else number(dynamics.get("friction", "0")),
         )
-
-
-def _end(joint: ET.Element, role: str) -> str:
-    element = joint.find(role)
-    return "" if element is None else element.get("link", "")
 
 
 def unit_axis(joint: ET.Element) -> Floats:
@@ -154,7 +150,7 @@ class Reading:
     @classmethod
     def of(cls, root: ET.Element) -> Reading:
         """Read a URDF in which `inspect_urdf` found nothing impossible."""
-        above = {_end(joint, "child"): joint for joint in root.findall("joint")}
+        above = {joint_end(joint, "child"): joint for joint in root.findall("joint")}
         links = _parents_first(root, above)
         inertials = [link.find("inertial") for link in links]
         origins = [None if i is None else i.find("origin") for i in inertials]
@@ -224,7 +220,7 @@ def _parents_first(root: ET.Element, above: dict[str, ET.Element]) -> list[ET.El
     elements = {link.get("name", ""): link for link in root.findall("link")}
     below: dict[str, list[str]] = {}
     for child, joint in above.items():
-        below.setdefault(_end(joint, "parent"), []).append(child)
+        below.setdefault(joint_end(joint, "parent"), []).append(child)
     ordered = [name for name in elements if name not in above]
     for name in ordered:  # grows while it is walked
         ordered += below.get(name, [])
@@ -235,5 +231,5 @@ def _tensor(inertial: ET.Element | None) -> list[float]:
     element = None if inertial is None else inertial.find("inertia")
     if element is None:
         return [0.0] * 9
-    xx, xy, xz, yy, yz, zz = (number(element.get(f"i{ij}", "")) for ij in ("xx", "xy", "xz", "yy", "yz", "zz"))
+    xx, xy, xz, yy, yz, zz = (number(element.get(key, "")) for key in ATTRIBUTES["inertia"])
     return [xx, xy, xz, xy, yy, yz, xz, yz, zz]

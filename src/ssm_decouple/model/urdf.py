@@ -275,6 +275,12 @@ def root_link(root: ET.Element) -> str:
     return next(link.get("name", "") for link in root.findall("link") if link.get("name") not in children)
 
 
+def joint_end(joint: ET.Element, role: str) -> str:
+    """Return the name of a joint's "parent" or "child" link; "" where it names none."""
+    element = joint.find(role)
+    return "" if element is None else element.get("link", "")
+
+
 def tip_links(root: ET.Element) -> list[str]:
     """Return the links at the ends of the branches that at least one joint moves, in file order; no wheel's rotor."""
     joints = {joint.find("child").get("link"): joint for joint in root.findall("joint")}  # type: ignore[union-attr]
