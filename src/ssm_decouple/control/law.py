@@ -706,6 +706,7 @@ class SelectiveLaw(Settled):
         targets, velocities = self._flat_vectors(target, target_velocity)
         self.evaluate(near, self.layout.targets_from(origin, targets), velocities, out, previous)
         out[6 + self._n + kernel.POSITION :][:3] += origin
+
     def _other_command(
         self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, previous: ArrayLike, out: Floats
     ) -> int:

@@ -1027,7 +1027,9 @@ def advance(
             if settings[DIFFERS] > 0.0:
                 start, end = piece[0:2], piece[2:4]
                 model = parts[MODEL]
-                add_motion_of_path(own_parent, own_tree, U, settings, start, end, span, R_piece, turning, own_work, model)
+                add_motion_of_path(
+                    own_parent, own_tree, U, settings, start, end, span, R_piece, turning, own_work, model
+                )
             else:
                 parts[MODEL] = parts[TRUTH]
             plan_piece(command, h * (step + 1) - span, h * (step + 1), piece)
