@@ -13,9 +13,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError
-from ssm_decouple.momentum.protection import Protection, checked_protection
 from ssm_decouple.model.origin import from_base
-from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.momentum.protection import Protection, checked_protection
 
 try:
     from pink.tasks import Task

@@ -305,12 +305,6 @@ def tip_links(root: ET.Element) -> list[str]:
     return [name for name in names if name not in parents and name in moved and name not in marks]
 
 
-def joint_end(joint: ET.Element, role: str) -> str:
-    """Return the name of the link that is a joint's "parent" or "child"."""
-    element = joint.find(role)
-    return "" if element is None else element.get("link", "")
-
-
 @dataclass(frozen=True)
 class Shape:
     """A box, cylinder or sphere that stands for a piece of a link.
