@@ -16,7 +16,7 @@ from ssm_decouple.files import writable_folder, written_whole
 
 T = TypeVar("T")
 
-ROOM = 30.0  # below the floor of a logarithmic axis, for the words about it
+ROOM = 300.0  # below the floor of a logarithmic axis, for the words about it
 COLUMN = 3.45  # inches, one column of a two-column page
 PAGE = 7.1
 
