@@ -107,7 +107,7 @@ def test_options_reach_the_simulation(call, short_case, tmp_path):
 )
 def test_a_motion_of_other_settings_is_not_replaced(call, short_case, tmp_path, words, says):
     place = tmp_path / "out" / "short" / "selective.nc"
-    usual = ("run", short_case, "--no-figures", "-o", tmp_path / "out")
+    usual = ("run", short_case, "--no-figures", "--no-progress", "-o", tmp_path / "out")
     assert call(*usual).returncode == 3
     first = place.read_bytes()
     again = call(*usual)

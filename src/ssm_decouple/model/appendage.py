@@ -120,10 +120,14 @@ class Appendage:
             raise self._error(key, "it must be a number") from None
         if value.shape != ():
             raise self._error(key, "it must be a number")
-        if not abs(value) <= _LARGEST:
-            raise self._error(key, f"it must be finite, and {_LARGEST:g} at most")
-        object.__setattr__(self, key, float(value))
-        return float(value)
+        try:
+            number = float(value)
+        except OverflowError:  # a whole number of hundreds of digits
+            number = 2 * _LARGEST
+        if _LARGEST < abs(number) < np.inf:
+            raise self._error(key, f"it must be {_LARGEST:g} at most")
+        object.__setattr__(self, key, number)
+        return number
 
     def _vector(self, key: str) -> Floats:
         try:
