@@ -691,10 +691,11 @@ class SelectiveLaw(Settled):
             status = self._other_command(q, target, target_velocity, previous_rates, out)
         if self.hold_nodes and status == kernel.OK:
             status = self._hold(q, np.asarray(target), np.asarray(target_velocity), np.asarray(previous_rates), out)
-        if status == kernel.FAR_AWAY:
-            self._evaluate_from_base(q, target, target_velocity, out, previous_rates)
-        elif status:
-            self._refuse(q, target, target_velocity, previous_rates, out, status)
+        if status:
+            if status == kernel.FAR_AWAY:
+                self._evaluate_from_base(q, target, target_velocity, out, previous_rates)
+            else:
+                self._refuse(q, target, target_velocity, previous_rates, out, status)
 
     def _evaluate_from_base(
         self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, out: Floats, previous: ArrayLike
