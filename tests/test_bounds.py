@@ -139,7 +139,9 @@ def test_it_holds_within_a_small_memory(tmp_path):
 
 
 def test_what_is_told(ets_vii):
-    with pytest.raises(ssm.InputError, match=r"1e-09 s makes 5e\+08 physics steps of 0.5 s, 1e\+08 at most: use 5e-09 s"):
+    with pytest.raises(
+        ssm.InputError, match=r"1e-09 s makes 5e\+08 physics steps of 0.5 s, 1e\+08 at most: use 5e-09 s"
+    ):
         simulated(0.5, 0.1, ssm.Dynamic(step=1e-9))
     with pytest.raises(ssm.InputError, match=r"record of 5e\+06 s in steps of 0.1 s would take .* GiB .* longer dt"):
         simulated(5e6, 0.1)
@@ -154,7 +156,7 @@ def test_a_body_that_does_not_turn_may_be_asked_for_any_time():
 
 @pytest.mark.parametrize("bad", [0, -1, 1.5, True, "3", None, np.nan])
 def test_counts_are_whole_numbers(bad):
-    with pytest.raises(ssm.InputError, match="count is .*; give a whole number from 1"):
+    with pytest.raises(ssm.InputError, match=r"count is .*; give a whole number from 1"):
         as_count("count", bad, 10)
 
 
@@ -165,7 +167,7 @@ def test_counts_and_bytes():
             as_count("count", large, 10)
     refuse_more_than_fits("it", MOST_BYTES, "mend")
     for size in (MOST_BYTES + 1, np.inf, np.nan):
-        with pytest.raises(ssm.InputError, match="it would take .* at most; mend"):
+        with pytest.raises(ssm.InputError, match=r"it would take .* at most; mend"):
             refuse_more_than_fits("it", size, "mend")
 
 
@@ -173,14 +175,18 @@ def test_counts_and_bytes():
 
 
 def test_calls_of_compiled_steps_are_short(ets_vii):
-    motion = dynamic.DynamicMotion(ssm.Dynamic(), ssm.SelectiveLaw(ets_vii, ssm.Protection("yaw")), ets_vii.configuration())
+    motion = dynamic.DynamicMotion(
+        ssm.Dynamic(), ssm.SelectiveLaw(ets_vii, ssm.Protection("yaw")), ets_vii.configuration()
+    )
     assert motion._steps_at_once * (6 + ets_vii.n_joints) ** 2 <= dynamic.STEP_WORK
 
 
 @pytest.mark.filterwarnings("ignore:drives at their torque limits")
 def test_pieces_of_a_hold_change_nothing(ets_vii, monkeypatch):
     """One call or many: the same numbers, bit for bit."""
-    physics = ssm.Dynamic(step=0.002, servo=ssm.Servo(period=0.02, torque_limits=1.0), load=ssm.Load((0.1, 0, 0), start=0.3))
+    physics = ssm.Dynamic(
+        step=0.002, servo=ssm.Servo(period=0.02, torque_limits=1.0), load=ssm.Load((0.1, 0, 0), start=0.3)
+    )
     found = []
     for work in (10**9, 60 * 12**2):  # all 250 steps of a sample, and 60 at a time
         monkeypatch.setattr(dynamic, "STEP_WORK", work)

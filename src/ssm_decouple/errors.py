@@ -8,7 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-
 MOST_BYTES = 2 * 2**30  # of memory for one record or table
 
 
