@@ -156,7 +156,7 @@ def test_a_body_that_does_not_turn_may_be_asked_for_any_time():
 
 @pytest.mark.parametrize("bad", [0, -1, 1.5, True, "3", None, np.nan])
 def test_counts_are_whole_numbers(bad):
-    with pytest.raises(ssm.InputError, match="count is .*; give a whole number from 1"):
+    with pytest.raises(ssm.InputError, match=r"count is .*; give a whole number from 1"):
         as_count("count", bad, 10)
 
 
@@ -167,7 +167,7 @@ def test_counts_and_bytes():
             as_count("count", large, 10)
     refuse_more_than_fits("it", MOST_BYTES, "mend")
     for size in (MOST_BYTES + 1, np.inf, np.nan):
-        with pytest.raises(ssm.InputError, match="it would take .* at most; mend"):
+        with pytest.raises(ssm.InputError, match=r"it would take .* at most; mend"):
             refuse_more_than_fits("it", size, "mend")
 
 

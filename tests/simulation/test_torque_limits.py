@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 
 import numpy as np
@@ -49,7 +50,7 @@ def test_the_arm_arrives_and_the_physics_step_does_not_decide(ets_vii, limit):
         assert motion.attrs["energy_error"] < 1e-11
         assert max(json.loads(motion.attrs["largest_torques"])) <= limit
     joints = [motion.joint_positions.values for motion in motions.values()]
-    off = [np.abs(after - before).max() for before, after in zip(joints, joints[1:], strict=False)]
+    off = [np.abs(after - before).max() for before, after in itertools.pairwise(joints)]
     assert off[1] < 0.01
     assert 1.3 < off[1] / off[0] < 2.5  # 2 at first order
     at_limit = [float(motion.saturated_time[-1]) for motion in motions.values()]
@@ -147,7 +148,7 @@ def test_the_summary_names_the_drives(ets_vii):
 @settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(seed=st.integers(0, 10**6), k=st.integers(0, 3), share=st.floats(0.05, 0.95))
 def test_limited_torques_keep_what_the_base_needs(seed, k, share):
-    """By Pinocchio's forward dynamics: limits are kept, and along U the base accelerates as asked where they allow it."""
+    """By Pinocchio's forward dynamics: limits are kept, and along U the base accelerates as asked all the same."""
     robot, rng = random_robot(seed % 1000, 7, 0.3), np.random.default_rng(seed)
     n, model = robot.n_joints, robot.model.copy()
     model.gravity = pin.Motion.Zero()

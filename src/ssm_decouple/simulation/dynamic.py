@@ -505,10 +505,10 @@ def drives_at_limits(motion: xr.Dataset) -> str:
     if not joints:
         return ""
     named = ", ".join(f"{name} for {100 * share:.2g} %" for name, share in joints.items())
-    told = f"{named} of the time"
     cost = _cost_of_limits(motion).max(initial=0.0)
     unit = " (m count as rad)" if np.any(motion.U_c.values[:3]) else ""
-    return told + (f"; meanwhile the servo has moved the protected directions by {np.rad2deg(cost):.2g} deg{unit}")
+    moved = f"the servo has moved the protected directions by {np.rad2deg(cost):.2g} deg{unit}"
+    return f"{named} of the time; meanwhile {moved}"
 
 
 def warn_of_limits(motion: xr.Dataset) -> None:
@@ -520,9 +520,9 @@ def warn_of_limits(motion: xr.Dataset) -> None:
     largest = np.abs(motion.protected_angle.values).max(initial=0.0)
     if np.any(_cost_of_limits(motion) > max(0.1 * largest, NEXT_TO_NOTHING)):
         warnings.warn(
-            f"drives at their torque limits have cost protection: {drives_at_limits(motion)}, of {np.rad2deg(largest):.2g} "
-            "deg in all; larger torques help, lower rate or acceleration limits, a smooth_start, or a servo that "
-            "protects",
+            f"drives at their torque limits have cost protection: {drives_at_limits(motion)}, of "
+            f"{np.rad2deg(largest):.2g} deg in all; larger torques help, lower rate or acceleration limits, "
+            "a smooth_start, or a servo that protects",
             DecoupleWarning,
             stacklevel=3,
         )

@@ -469,7 +469,7 @@ def free_accelerations(M: Floats, bias: Floats, small: Floats, accelerations: Fl
 
 @compiled
 def fitting_share(fixed: Floats, torque: Floats, limits: Floats) -> float:
-    """Return the largest share s in [0, 1] for which fixed + s (torque - fixed) keeps the limits; `fixed` keeps them."""
+    """Return the largest s in [0, 1] for which fixed + s (torque - fixed) keeps the limits, as `fixed` does."""
     share = 1.0
     for j in range(torque.shape[0]):
         if torque[j] > limits[j]:
@@ -577,9 +577,9 @@ def keep_limits(
     """Bring all torques (n,) inside their limits together where one is above its own, as rates are.
 
     One joint cut by itself would leave the null space of J_sub; together they come to the commanded rates later. First
-    come the torques that give the base its acceleration `asked` (k,) along U (6, k) with the least change of the joints'
-    free motion; of what the servo wants beside it the share is taken that the limits allow. Where this is next to
-    nothing, plain scaling takes over, so that no drive at its limit can lock the others.
+    come the torques that give the base the acceleration `asked` (k,) along U (6, k) with the least change of the
+    joints' free motion; of what the servo wants beside it the share is taken that the limits allow. Where this is next
+    to nothing, plain scaling takes over, so that no drive at its limit can lock the others.
     """
     n = torque.shape[0]
     needed, zeros, shares = small[NEEDED][:n], small[ZEROS][:n], small[SHARE]
