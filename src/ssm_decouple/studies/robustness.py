@@ -18,6 +18,7 @@ from ssm_decouple.errors import (
     as_positive,
     as_seed,
     as_whole,
+    shown,
 )
 from ssm_decouple.model.perturb import Tolerances, perturbed
 from ssm_decouple.momentum.protection import Protection
@@ -28,6 +29,7 @@ from ssm_decouple.studies.comparison import largest_rotation_deg
 
 LEVELS = (0.01, 0.02, 0.05, 0.1)
 RUNS = 200
+MOST = 10**6  # runs, or workers
 FEEDBACK_GAIN = 1.0  # 1/s
 STEP = 0.02  # s: of the physics, a quarter of the servo's radian
 METRES_PER_LEVEL = 0.1  # what a tolerance of 1 stands for where lengths are concerned: 5 % is 5 mm
@@ -161,9 +163,12 @@ class Robustness(Settled):
         for level in self.levels:
             if not 0 < level < 1:
                 raise InputError(f"level {level} is no tolerance: give shares above 0 and below 1, 0.05 for 5 %")
-        self.runs = as_whole("runs", self.runs, 1, "give at least 1")
+        for name, wrong in (("runs", "runs are no study"), ("workers", "workers do nothing")):
+            try:
+                setattr(self, name, as_whole(name, getattr(self, name), most=MOST))
+            except InputError:
+                raise InputError(f"{shown(getattr(self, name))} {wrong}; give from 1 to {MOST}") from None
         self.feedback_gain = as_positive("feedback_gain", self.feedback_gain, "it must be positive, 1/s")
-        self.workers = as_whole("workers", self.workers, 1, "give at least 1", 1024)
         self.seed = as_seed("seed", self.seed)
         if self.case.protection.k == 0 or np.any(self.case.protection.U_twist[:3]):
             raise InputError(f"case '{self.case.name}' needs a protection of rotation: one to three directions")
