@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 from abc import ABCMeta
 from collections.abc import Mapping
 from typing import Any, ClassVar, NoReturn
@@ -19,6 +20,12 @@ class _Settling(ABCMeta):
         made = super().__call__(*args, **kwargs)
         object.__setattr__(made, "_settled", True)
         return made
+
+    @property
+    def __signature__(cls) -> inspect.Signature:
+        """The arguments of the class, which Python would look for in the method above."""
+        made = inspect.signature(cls.__init__)  # type: ignore[misc]
+        return made.replace(parameters=list(made.parameters.values())[1:], return_annotation=inspect.Signature.empty)
 
 
 class Settled(metaclass=_Settling):

@@ -35,6 +35,8 @@ def base_twist_map(A_g: ArrayLike, out: Floats | None = None) -> Floats:
         InputError: a wrong shape, or an inertia of the whole that is singular or not finite.
     """
     given = np.asfortranarray(as_floats("A_g", A_g))
+    if not np.all(np.isfinite(given)):
+        raise InputError("A_g is not finite")
     if given.ndim != 2 or given.shape[0] != 6 or given.shape[1] < 7:
         raise InputError(f"A_g has shape {given.shape}; it needs (6, 6 + n) with n joints, one or more")
     J_base = _output(out, (6, given.shape[1] - 6))
@@ -110,6 +112,8 @@ def _matrix(name: str, values: ArrayLike) -> Floats:
     matrix = np.ascontiguousarray(as_floats(name, values))
     if matrix.ndim != 2:
         raise InputError(f"{name} has shape {matrix.shape}; it needs two dimensions, rows and joints")
+    if not np.all(np.isfinite(matrix)):
+        raise InputError(f"{name} is not finite")
     return matrix
 
 
@@ -129,6 +133,6 @@ def _output(out: Floats | None, shape: tuple[int, ...]) -> Floats:
     if out is None:
         return np.empty(shape)
     fit = type(out) is np.ndarray and out.dtype == np.float64 and out.shape == shape
-    if not (fit and out.flags.c_contiguous and out.flags.writeable):
+    if not (fit and out.flags.carray):
         raise InputError(f"out must be a writable, contiguous float64 array {shape}")
     return out

@@ -1090,7 +1090,10 @@ def wrong_size(n: int, parameters: Floats, targets: Floats, velocities: Floats, 
 
 @compiled_for("boolean(float64[::1], float64[:, ::1])")
 def off_unit(q: Floats, columns: Floats) -> bool:
-    """Say whether the quaternion of q, or the cosine and sine of a continuous joint, is not of unit length."""
+    """Say whether q is not finite, or its quaternion or the cosine and sine of a joint are not of unit length."""
+    for i in range(q.shape[0]):
+        if not abs(q[i]) < np.inf:
+            return True
     if not abs(np.sqrt(q[3] ** 2 + q[4] ** 2 + q[5] ** 2 + q[6] ** 2) - 1.0) <= UNIT:
         return True
     for j in range(columns.shape[1]):

@@ -799,7 +799,8 @@ class SelectiveLaw(Settled):
         plain = type(q) is array and q.dtype == np.float64 and q.shape == (model.nq,) and q.flags.carray
         if not plain or kernel.off_unit(q, columns):
             q = self.robot.checked(q)
-        if not (type(joint_rates) is array and joint_rates.dtype == np.float64 and joint_rates.shape == (self._n,)):
+        plain = type(joint_rates) is array and joint_rates.dtype == np.float64 and joint_rates.shape == (self._n,)
+        if not (plain and joint_rates.flags.c_contiguous):
             joint_rates = self._checked_rates(joint_rates)
         pin.computeCentroidalMap(model, data, from_base(q))
         kernel.base_twist_map(A_g, self._J_base)
@@ -998,7 +999,7 @@ class SelectiveLaw(Settled):
 
     def _checked_out(self, out: Floats) -> Floats:
         fit = type(out) is np.ndarray and out.dtype == np.float64 and out.shape == (self.size,)
-        if not (fit and out.flags.c_contiguous and out.flags.writeable):
+        if not (fit and out.flags.carray):
             raise InputError(f"out must be a writable, contiguous float64 array ({self.size},), law.size long")
         return out
 

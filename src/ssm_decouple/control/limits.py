@@ -64,9 +64,10 @@ class Limits:
             raise InputError(f"clearance is {shown(self.clearance)}; give a Clearance, such as Clearance(0.05)")
         if self.position is not None:
             position = as_floats("position limits", self.position)
-            if position.ndim != 2:
+            if position.ndim != 2 or np.any(np.isnan(position)):
                 raise InputError(
-                    f"position limits have shape {position.shape}; they need (n, 2): lower and upper, a row a joint"
+                    f"position limits have shape {position.shape}; they need (n, 2) numbers: lower and upper, a row "
+                    "a joint"
                 )
             object.__setattr__(self, "position", tuple(map(tuple, position.tolist())))
 

@@ -477,8 +477,9 @@ class Layout(Settled):
         words = [task.word for task in self.tasks if task.takes_target]
         if len(words) == 1:
             values = [values]
-        elif not isinstance(values, Sequence | np.ndarray) or len(values) != len(words):
-            found = len(values) if isinstance(values, Sequence | np.ndarray) else "no sequence"
+        several = isinstance(values, Sequence) or (isinstance(values, np.ndarray) and values.ndim > 0)
+        if not several or len(values) != len(words):
+            found = len(values) if several else "no sequence"
             raise InputError(f"{name}: {found}; give {len(words)}, one a task, in their order: {', '.join(words)}")
         left = iter(values)
         return [next(left) if task.takes_target else None for task in self.tasks]

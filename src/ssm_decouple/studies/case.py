@@ -185,7 +185,11 @@ class Case:
         joints = self.joints
         if joints is not None:
             joints = fixed(joints) if isinstance(joints, Mapping) else fixed_array(as_floats("joints", joints))
+            if isinstance(joints, np.ndarray) and (joints.ndim != 1 or not np.all(np.isfinite(joints))):
+                raise InputError(f"joints is {shown(joints.tolist())}; it needs finite numbers, one a joint")
         kept: dict[str, Any] = {"joints": joints, "target": fixed(self.target)}
+        if not (callable(self.target) or (isinstance(self.law, Mapping) and self.law.get("tasks"))):
+            kept["target"] = tuple(as_triple("target", self.target, "inertial axes").tolist())
         for name in ("base_position", "base_rpy"):
             kept[name] = tuple(as_triple(name, getattr(self, name)).tolist())
         for name in ("duration", "dt"):
@@ -221,7 +225,7 @@ class Case:
 
     def make_law(self, protection: Protection | Schedule | None = None, dt: float | None = None) -> SelectiveLaw:
         """Return the case's law, with another protection or time between samples than its own if one is given."""
-        step = self.dt if dt is None else dt
+        step = self.dt if dt is None else as_positive("dt", dt, "it must be a positive time, s")
         planned = bool(self.law.keys() & {"hold_nodes", "acceleration_limit", "limits"})
         chosen = self.protection if protection is None else protection
         sample_time = step if planned else None

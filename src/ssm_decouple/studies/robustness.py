@@ -18,6 +18,7 @@ from ssm_decouple.errors import (
     as_positive,
     as_seed,
     as_whole,
+    shown,
 )
 from ssm_decouple.model.perturb import Tolerances, perturbed
 from ssm_decouple.momentum.protection import Protection
@@ -163,9 +164,15 @@ class Robustness(Settled):
         for level in self.levels:
             if not 0 < level < 1:
                 raise InputError(f"level {level} is no tolerance: give shares above 0 and below 1, 0.05 for 5 %")
-        self.runs = as_whole("runs", self.runs, 1, "give at least 1", MOST_RUNS)
+        for name, most, wrong in (
+            ("runs", MOST_RUNS, "runs are no study"),
+            ("workers", MOST_WORKERS, "workers do nothing"),
+        ):
+            try:
+                setattr(self, name, as_whole(name, getattr(self, name), most=most))
+            except InputError:
+                raise InputError(f"{shown(getattr(self, name))} {wrong}; give from 1 to {most:,}") from None
         self.feedback_gain = as_positive("feedback_gain", self.feedback_gain, "it must be positive, 1/s")
-        self.workers = as_whole("workers", self.workers, 1, "give at least 1", MOST_WORKERS)
         self.seed = as_seed("seed", self.seed)
         if self.case.protection.k == 0 or np.any(self.case.protection.U_twist[:3]):
             raise InputError(f"case '{self.case.name}' needs a protection of rotation: one to three directions")

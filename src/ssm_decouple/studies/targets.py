@@ -14,7 +14,7 @@ from ssm_decouple.batch import Batch
 from ssm_decouple.batch.results import Motions
 from ssm_decouple.batch.rows import move_poses, place_points
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError, as_floats, as_kind, as_number, as_seed, as_whole
+from ssm_decouple.errors import InputError, as_floats, as_kind, as_number, as_seed, as_whole, shown
 from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum.protection import AXES, Protection
 from ssm_decouple.settled import Settled, fixed
@@ -578,4 +578,9 @@ def _percentiles(values: Floats, share: float) -> Triple | None:
 
 
 def _check_count(count: int) -> None:
-    as_whole("count of targets", count, 1, "give a whole number from 1", MOST_TARGETS)
+    try:
+        as_whole("count", count, most=MOST_TARGETS)
+    except InputError:
+        raise InputError(
+            f"{shown(count)} targets are no study; give a whole number from 1 to {MOST_TARGETS:,}"
+        ) from None

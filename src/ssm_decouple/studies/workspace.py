@@ -449,8 +449,8 @@ def joint_slice(
     points = as_whole("points", points, 2, most=MOST_POINTS)
     protections = as_items("protections", protections, "give a list, such as ['none', 'yaw']")
     posture = as_floats("posture", posture)
-    if posture.shape != (robot.n_joints,):
-        raise InputError(f"posture has shape {posture.shape}; it needs ({robot.n_joints},), a position a joint")
+    if posture.shape != (robot.n_joints,) or not np.all(np.isfinite(posture)):
+        raise InputError(f"posture is {shown(posture.tolist())}; it needs {robot.n_joints} finite numbers, one a joint")
     ranges = joint_ranges(robot)
     first, second = (np.linspace(low, high, points) for low, high in ranges[[i, j]])
     rows = np.tile(posture, (points * points, 1))
