@@ -214,3 +214,11 @@ def test_a_long_sample_hears_ctrl_c_and_keeps_the_motion(servo):
     command = [sys.executable, "-c", textwrap.dedent(code)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=400)
     assert done.stdout == "kept 1\n", done.stderr
+
+
+def test_a_film_without_end_is_refused():
+    from ssm_decouple.viewing.viewer.export import _times
+
+    with pytest.raises(ssm.InputError, match=r"film of .* pictures, 100,000 at most: use a speed of"):
+        _times(150.0, 1e-12, 25)
+    assert len(_times(150.0, 10.0, 25)) == 376
