@@ -27,7 +27,7 @@ from ssm_decouple.errors import (
 from ssm_decouple.model.robot import Robot, checked_robot, per_joint, warn_of_degrees
 from ssm_decouple.momentum.flow import munthe_kaas
 from ssm_decouple.momentum.protection import Protection, checked_protection
-from ssm_decouple.settled import Settled
+from ssm_decouple.settled import Settled, fixed_array
 
 if TYPE_CHECKING:
     from ssm_decouple.control.limits import LimitedRates, LimitedStep, Limits
@@ -345,7 +345,7 @@ class SelectiveLaw(Settled):
         if acceleration_limit is not None:
             self.acceleration_limits = per_joint(robot, "acceleration_limit", acceleration_limit)
         self.joint_weights: Floats = (
-            _default_weights(robot, self.rate_limits)
+            fixed_array(_default_weights(robot, self.rate_limits))
             if joint_weights is None
             else per_joint(robot, "joint_weights", joint_weights, "finite")
         )
