@@ -28,7 +28,7 @@ from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.robot import Robot, checked_robot, per_joint, warn_of_degrees
 from ssm_decouple.momentum.flow import munthe_kaas, places_on_hold, quadrature_along, ways_to_nodes
 from ssm_decouple.momentum.protection import Protection, checked_protection
-from ssm_decouple.settled import Settled
+from ssm_decouple.settled import Settled, fixed_array
 
 if TYPE_CHECKING:
     from ssm_decouple.control.limits import LimitedRates, LimitedStep, Limits
@@ -378,7 +378,7 @@ class SelectiveLaw(Settled):
         if acceleration_limit is not None:
             self.acceleration_limits = per_joint(robot, "acceleration_limit", acceleration_limit)
         self.joint_weights: Floats = (
-            _default_weights(robot, self.rate_limits)
+            fixed_array(_default_weights(robot, self.rate_limits))
             if joint_weights is None
             else per_joint(robot, "joint_weights", joint_weights, "finite")
         )

@@ -114,6 +114,7 @@ class FrameTask(Task):
     level: int = 1
 
 
+@dataclass(frozen=True)
 class PositionTask(FrameTask):
     """Bring the origin of a frame to a position: target (3,), m, inertial axes; its velocity (3,), m/s.
 
@@ -137,6 +138,7 @@ class PositionTask(FrameTask):
         return 3, 3
 
 
+@dataclass(frozen=True)
 class OrientationTask(FrameTask):
     """Turn a frame to an attitude: target a rotation matrix (3, 3), frame to inertial axes, or a pin.SE3's.
 
@@ -167,6 +169,7 @@ class OrientationTask(FrameTask):
         return 9, 3
 
 
+@dataclass(frozen=True)
 class PoseTask(FrameTask):
     """Bring a frame to a pose: target a pin.SE3 or a homogeneous matrix (4, 4), frame to inertial.
 
@@ -517,7 +520,10 @@ class Layout(Settled):
                 gap = np.abs(part @ part.T - np.eye(3)).max()
                 if gap > 1e-7 or np.linalg.det(part) < 0:
                     return f"a target is no rotation: its matrix {part.tolist()} needs right-handed orthonormal columns"
-        return "a target is no rotation or has no direction"
+        return (
+            "a target is no rotation seen from this configuration: the length of the quaternion q[3:7] is off by more "
+            "than a rotation task bears, 1e-7; use pinocchio.normalize(model, q)"
+        )
 
 
 _NAMES = "give a list of joint names, or None for all joints"

@@ -27,7 +27,7 @@ from ssm_decouple.batch.engine import Batch
 from ssm_decouple.errors import InputError, as_floats, as_items, as_positive, as_seed, as_whole, shown
 from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum.protection import Protection
-from ssm_decouple.settled import Settled
+from ssm_decouple.settled import Settled, fixed_array
 from ssm_decouple.studies.postures import MARGIN, PROTECTIONS, joint_ranges
 from ssm_decouple.studies.shares import CONFIDENCE, wilson
 
@@ -263,7 +263,7 @@ class Workspace(Settled):
         self._ranges = joint_ranges(self.robot)
         self.grid = Grid.about(self.robot, self.voxel)
         self.margins = tuple(sorted({*MARGINS, self.margin}))
-        self.edges = np.union1d(CURVE, self.margins)
+        self.edges = fixed_array(np.union1d(CURVE, self.margins))
         self._parsed = [Protection.parse(text) for text in self.protections]
         self._engine = Batch(self.robot, threads=self.threads)
         self._size = 2 ** max(0, round(np.log2(self.samples / BLOCKS)))  # of a block
