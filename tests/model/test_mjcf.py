@@ -13,6 +13,16 @@ from mujoco_robots import mass_matrix
 
 import ssm_decouple as ssm
 
+
+@pytest.fixture(autouse=True, scope="module")
+def _in_a_scratch_folder(tmp_path_factory: pytest.TempPathFactory):
+    """MuJoCo writes a log into the folder that it runs in."""
+    before = os.getcwd()
+    os.chdir(tmp_path_factory.mktemp("scratch"))
+    yield
+    os.chdir(before)
+
+
 BUS = '<inertial pos="0.1 0 0.05" mass="100" diaginertia="20 25 30"/>'
 ARM = '<inertial pos="0.3 0 0.05" quat="1 0.2 0.3 0.1" mass="8" diaginertia="0.5 2 2.1"/>'
 
