@@ -1,5 +1,6 @@
 """MJCF against MuJoCo itself: what the two make of the same file, body by body and number by number."""
 
+import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
