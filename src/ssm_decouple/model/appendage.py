@@ -35,6 +35,7 @@ _THIN = 1e-14
 
 
 _LARGEST = 1e9  # of any number of an appendage, SI: beyond it squares and cubes leave floating point
+_MOST_SEGMENTS = 1000  # each of them a joint more
 
 
 @dataclass(frozen=True)
@@ -90,8 +91,9 @@ class Appendage:
                 raise self._error(key, f"it must be above zero and finite, in {unit}{rigid}")
         if not 0 <= self._number("damping_ratio") < 1:
             raise self._error("damping_ratio", "it must be from 0 to below 1, for example 0.005")
-        if not isinstance(self.segments, Integral) or isinstance(self.segments, bool) or self.segments < 1:
-            raise self._error("segments", "it must be a whole number from 1")
+        count = self.segments
+        if not isinstance(count, Integral) or isinstance(count, bool) or not 1 <= int(count) <= _MOST_SEGMENTS:
+            raise self._error("segments", f"it must be a whole number from 1, and {_MOST_SEGMENTS} at most")
         if not np.isfinite(self._number("turn")):
             raise self._error("turn", "it must be a finite angle, rad")
         if abs(self.turn) > 2 * np.pi:
