@@ -130,7 +130,7 @@ def test_a_model_that_was_changed_is_refused_by_law_engine_and_simulation():
         lambda: ssm.batch.Batch(robot),
         lambda: ssm.simulate(law, q, X, 1.0, 0.5),
     ):
-        with pytest.raises(ssm.ModelError, match="joint 'joint_2' in robot.model was changed"):
+        with pytest.raises(ssm.ModelError, match=r"joint 'joint_2' in robot\.model was changed"):
             call()
 
 
