@@ -221,9 +221,14 @@ def as_function(name: str, value: Callable[..., T] | None) -> Callable[..., T] |
     Raises:
         InputError: it is neither; the message calls it `name`.
     """
-    if value is not None and not callable(value):
+    if value is not None and not is_function(value):
         raise InputError(f"{name} is {shown(value)}; it must be a function, or None")
     return value
+
+
+def is_function(value: object) -> bool:
+    """Say whether a value can be called as a function; a class is none."""
+    return callable(value) and not isinstance(value, type)
 
 
 def refuse_more_than_fits(what: str, size: float, mend: str) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import FULL, LostDirection, SelectiveLaw
 from ssm_decouple.control.task import RateTask
-from ssm_decouple.errors import InputError, as_floats, as_items, as_kind, as_number, as_positive, shown
+from ssm_decouple.errors import InputError, as_floats, as_items, as_kind, as_number, as_positive, is_function, shown
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.settled import Settled, fixed, fixed_array
@@ -74,7 +74,7 @@ class Schedule(Settled):
             raise InputError("a schedule needs either hand_over, s, for protections with times, or progress(time, q)")
         self._starts: Floats = np.zeros(0)
         self._hand_over, self._progress = 1.0, progress
-        if progress is not None and not callable(progress):
+        if progress is not None and not is_function(progress):
             raise InputError(f"progress is {shown(progress)}; it must be a function of time, s, and configuration")
         given = as_items("protections", protections, "a schedule needs a list of two or more")
         if hand_over is not None:

@@ -36,7 +36,6 @@ _THIN = 1e-14
 
 
 _LARGEST = 1e9  # of any number of an appendage, SI: beyond it squares and cubes leave floating point
-_MOST_SEGMENTS = 1000  # each of them a joint more
 
 
 @dataclass(frozen=True)

@@ -26,6 +26,7 @@ from ssm_decouple.errors import (
     as_positive,
     as_switch,
     as_triple,
+    is_function,
     shown,
 )
 from ssm_decouple.model.origin import far_origin
@@ -324,7 +325,7 @@ def _smooth_pace(duration: float) -> Pace:
 def _reference(law: SelectiveLaw, target: Any | Target) -> Reference:
     """Return the flat targets and velocities as a function of time."""
     at_rest = law.layout.flat_velocities(None)
-    if callable(target):
+    if is_function(target):
 
         def moving(time: float) -> tuple[Floats, Floats]:
             told = target(time)
@@ -362,8 +363,8 @@ def _wanted(
             "feedback_gain and a servo that protects hold the base still along the protected directions; leave them "
             "out where a protected_rate is asked for"
         )
-    if not callable(given):
-        constant = as_floats("protected_rate", given)
+    if isinstance(given, type) or not callable(given):
+        constant = as_floats("protected_rate", given)  # type: ignore[arg-type]
         return lambda _: constant
     function = given
 

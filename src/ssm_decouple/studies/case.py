@@ -36,6 +36,7 @@ from ssm_decouple.errors import (
     as_positive,
     as_text,
     as_triple,
+    is_function,
     shown,
     unknown,
 )
@@ -188,7 +189,7 @@ class Case:
             if isinstance(joints, np.ndarray) and (joints.ndim != 1 or not np.all(np.isfinite(joints))):
                 raise InputError(f"joints is {shown(joints.tolist())}; it needs finite numbers, one a joint")
         kept: dict[str, Any] = {"joints": joints, "target": fixed(self.target)}
-        if not (callable(self.target) or (isinstance(self.law, Mapping) and self.law.get("tasks"))):
+        if not (is_function(self.target) or (isinstance(self.law, Mapping) and self.law.get("tasks"))):
             kept["target"] = tuple(as_triple("target", self.target, "inertial axes").tolist())
         for name in ("base_position", "base_rpy"):
             kept[name] = tuple(as_triple(name, getattr(self, name)).tolist())
