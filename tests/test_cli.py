@@ -55,7 +55,8 @@ def test_a_case_that_does_not_arrive_has_its_own_status(call, tmp_path):
     assert done.returncode == 3
     (row,) = json.loads(done.stdout)["rows"]
     assert (row["outcome"], row["law"], row["k"]) == ("stalled", "reactionless", 3)
-    assert done.stderr == ""
+    (told,) = done.stderr.splitlines()  # it chatters at its singularity
+    assert told.startswith("warning: the commanded rates reverse from sample to sample from 10")
 
 
 def test_compare_prints_one_table_and_says_why(call, tmp_path):
@@ -216,7 +217,7 @@ def test_a_target_out_of_reach_warns_and_runs(write, tmp_path):
 
 
 def test_ctrl_c_keeps_what_is_done(short_case, write, tmp_path):
-    endless = write(short_case.read_text().replace("duration = 2 ", "duration = 1e5 "), "endless.toml")
+    endless = write(short_case.read_text().replace("duration = 2 ", "duration = 5e4 "), "endless.toml")
     words = [*COMMAND, "run", str(short_case), str(endless), "--no-figures", "-o", str(tmp_path / "out")]
     process = subprocess.Popen(
         words,
@@ -236,7 +237,7 @@ def test_ctrl_c_keeps_what_is_done(short_case, write, tmp_path):
     assert "short" in out
     partial = ssm.load_motion(tmp_path / "out" / "interrupted.nc")
     assert partial.attrs["outcome"] in ("running", "converged", "stalled")
-    assert 2 < partial.time.values[-1] < 1e5
+    assert 2 < partial.time.values[-1] < 5e4
     assert not list(Path(tmp_path).rglob("*.part*"))
 
 
