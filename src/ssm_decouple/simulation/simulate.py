@@ -345,7 +345,7 @@ def _reference(law: SelectiveLaw, target: Any | Target) -> Reference:
 
         return moving
     fixed = (
-        as_triple("target", target, "inertial axes")
+        as_triple("target", target, "inertial axes")  # type: ignore[arg-type]
         if law.layout.plain
         else _finite(law.layout.flat_targets(target), "target")
     )

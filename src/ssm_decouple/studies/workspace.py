@@ -116,7 +116,7 @@ class Grid:
         if not np.isfinite(checked_robot(robot).reach):
             raise InputError(f"'{robot.name}' reaches without end: a joint slides without limits; give it limits")
         size = as_positive("voxel", robot.reach / PER_REACH if edge is None else edge)
-        half = int(np.ceil(robot.reach / size))
+        half = int(np.ceil(min(robot.reach / size, float(VOXELS))))
         count = 2 * half + 1
         if count**3 > VOXELS:
             least = 1.01 * robot.reach / ((round(VOXELS ** (1 / 3)) - 1) // 2)
