@@ -28,7 +28,7 @@ from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.robot import Robot, checked_robot, per_joint, warn_of_degrees
 from ssm_decouple.momentum.flow import munthe_kaas, places_on_hold, quadrature_along, ways_to_nodes
 from ssm_decouple.momentum.protection import Protection, checked_protection
-from ssm_decouple.settled import Settled
+from ssm_decouple.settled import Settled, fixed_array
 
 if TYPE_CHECKING:
     from ssm_decouple.control.limits import LimitedRates, LimitedStep, Limits
@@ -1071,4 +1071,4 @@ def _default_weights(robot: Robot, rate_limits: Floats) -> Floats:
     others = np.delete(rate_limits, wheels)
     if wheels and others.size and np.all(np.isfinite([*rate_limits[wheels], others.max()])):
         weights[wheels] = (others.max() / rate_limits[wheels]) ** 2
-    return weights
+    return fixed_array(weights)

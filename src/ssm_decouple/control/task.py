@@ -114,6 +114,7 @@ class FrameTask(Task):
     level: int = 1
 
 
+@dataclass(frozen=True)
 class PositionTask(FrameTask):
     """Bring the origin of a frame to a position: target (3,), m, inertial axes; its velocity (3,), m/s.
 
@@ -137,6 +138,7 @@ class PositionTask(FrameTask):
         return 3, 3
 
 
+@dataclass(frozen=True)
 class OrientationTask(FrameTask):
     """Turn a frame to an attitude: target a rotation matrix (3, 3), frame to inertial axes, or a pin.SE3's.
 
@@ -167,6 +169,7 @@ class OrientationTask(FrameTask):
         return 9, 3
 
 
+@dataclass(frozen=True)
 class PoseTask(FrameTask):
     """Bring a frame to a pose: target a pin.SE3 or a homogeneous matrix (4, 4), frame to inertial.
 
