@@ -28,7 +28,17 @@ class _Settling(ABCMeta):
         return made.replace(parameters=list(made.parameters.values())[1:], return_annotation=inspect.Signature.empty)
 
 
-class Settled(metaclass=_Settling):
+class FixedArrays:
+    """What a class has whose public arrays are read-only: they stay so in copies and where they are unpickled."""
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state)
+        for name, value in state.items():
+            if name[0] != "_" and isinstance(value, np.ndarray):
+                value.flags.writeable = False  # NumPy does not keep it
+
+
+class Settled(FixedArrays, metaclass=_Settling):
     """What a class has whose settings are read when an object of it is made, and not again.
 
     Once it is made no public attribute can be assigned, but properties that have a setter and the names in
@@ -68,8 +78,8 @@ class FixedDict(dict[Any, Any]):
     __setitem__ = __delitem__ = __ior__ = _refuse
     clear = pop = popitem = setdefault = update = _refuse
 
-    def __reduce__(self) -> tuple[type[FixedDict], tuple[dict[Any, Any]]]:
-        return FixedDict, (dict(self),)
+    def __reduce__(self) -> tuple[Any, tuple[dict[Any, Any]]]:
+        return fixed, (dict(self),)
 
 
 class FixedList(list[Any]):
@@ -81,8 +91,8 @@ class FixedList(list[Any]):
     __setitem__ = __delitem__ = __iadd__ = __imul__ = _refuse
     append = extend = insert = remove = pop = clear = sort = reverse = _refuse
 
-    def __reduce__(self) -> tuple[type[FixedList], tuple[list[Any]]]:
-        return FixedList, (list(self),)
+    def __reduce__(self) -> tuple[Any, tuple[list[Any]]]:
+        return fixed, (list(self),)
 
 
 def fixed_array(values: NDArray[Any]) -> NDArray[Any]:

@@ -477,3 +477,52 @@ def test_plain_urdf_reads_before_it_writes():
     _, reading = plain_urdf(root, text)
     np.testing.assert_array_equal(reading.centres[1], [0.5, 0, 0])
     assert root.find("link[@name='arm']/inertial/origin").get("quat_xyzw") is None
+
+
+_PART = '<inertial><mass value="3"/><inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/></inertial>'
+_WHOLE = (
+    '<robot name="r" xmlns:b="http://b">'
+    f'<link name="bus">{_PART}</link><link name="arm">{_PART}</link><joint name="turn" type="revolute">'
+    '<parent link="bus"/><child link="arm"/><origin xyz="1 0 0"/><axis xyz="0 1 0"/>'
+    '<limit lower="-2" upper="2" effort="1" velocity="1"/></joint></robot>'
+)
+_LIMIT = '<limit lower="-2" upper="2" effort="1" velocity="1"/>'
+
+
+@pytest.mark.parametrize(
+    ("written", "instead", "words"),
+    [
+        (f'"arm">{_PART}', f'"arm"><collision>{_PART}</collision>', ("link arm", "inertial")),
+        (f'"arm">{_PART}', f'"arm"><visual><body>{_PART}</body></visual>', ("link arm", "inertial")),
+        (f'"arm">{_PART}', f'"arm"><physics>{_PART}</physics>', ("link arm", "inertial")),
+        (f'"arm">{_PART}', f'"arm">{_PART.replace("inertial>", "b:inertial>")}', ("link arm", "inertial")),
+        ("</robot>", f'<group><link name="more">{_PART}</link></group></robot>', ("inertial", "group")),
+        ("</robot>", f'<b:link name="more">{_PART}</b:link></robot>', ("link",)),
+        ("</robot>", '<include filename="arm.urdf"/></robot>', ("include",)),
+        ('<origin xyz="1 0 0"/>', '<place><origin xyz="1 0 0"/></place>', ("joint turn", "origin")),
+        ('<origin xyz="1 0 0"/>', '<b:origin xyz="1 0 0"/>', ("joint turn", "origin")),
+        ('<origin xyz="1 0 0"/>', '<origin b:xyz="1 0 0"/>', ("joint turn", "xyz")),
+        ('<origin xyz="1 0 0"/>', "<pose>1 0 0 0 0 0</pose>", ("joint turn", "pose", "origin")),
+        ('name="turn"', 'name="turn" rpy="0 0 1"', ("joint turn", "rpy")),
+        ('<axis xyz="0 1 0"/>', '<frame><axis xyz="0 1 0"/></frame>', ("joint turn", "axis")),
+        (_LIMIT, _LIMIT.replace("lower", 'unit="deg" lower'), ("joint turn", "unit")),
+        (_LIMIT, _LIMIT.replace("lower", "min").replace("upper", "max"), ("joint turn", "min", "lower")),
+        (_LIMIT, _LIMIT.replace('effort="1"', 'effort="-1"'), ("joint turn", "effort")),
+        (_LIMIT, _LIMIT.replace('velocity="1"', 'velocity="-1"'), ("joint turn", "velocity")),
+        ('<robot name="r"', '<robot name="r" scale="0.001"', ("robot", "scale")),
+    ],
+)
+def test_what_stands_where_it_is_not_read_is_refused_by_name(written, instead, words):
+    assert written in _WHOLE
+    ssm.Robot(_WHOLE, name="r")
+    with pytest.raises(ssm.ModelError) as refusal:
+        ssm.Robot(_WHOLE.replace(written, instead), name="r")
+    assert all(word in str(refusal.value) for word in words), str(refusal.value)
+
+
+def test_limits_that_are_not_kept_are_told():
+    soft = '<safety_controller soft_lower_limit="-1" soft_upper_limit="1" k_position="1" k_velocity="1"/>'
+    kept = ssm.Robot(_WHOLE.replace(_LIMIT, _LIMIT + soft), name="r")
+    assert any("soft limits -1 to 1" in str(finding) for finding in kept.findings)
+    endless = _WHOLE.replace("revolute", "continuous").replace('lower="-2" upper="2"', 'lower="2" upper="-2"')
+    assert any("2 to -2 are not kept" in str(finding) for finding in ssm.Robot(endless, name="r").findings)

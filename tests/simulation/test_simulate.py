@@ -407,3 +407,17 @@ def test_a_place_that_cannot_be_written_leaves_nothing_behind(motion, tmp_path):
     with pytest.raises(ssm.FileError, match="cannot write"):
         ssm.save_motion(motion, tmp_path / "motion.nc")
     assert [item.name for item in tmp_path.iterdir()] == ["motion.nc"]
+
+
+def test_what_ends_a_program_carries_the_motion_too():
+    robot = ssm.load_robot("ets_vii")
+    law = ssm.SelectiveLaw(robot, ssm.Protection("yaw"))
+
+    def leaves(time):
+        if time > 0.45:
+            raise SystemExit(3)
+        return [-1.8, -0.3, 1.2], [0.0, 0.0, 0.0]
+
+    with pytest.raises(SystemExit) as left:
+        ssm.simulate(law, robot.configuration(np.deg2rad([150, -20, -10, 0, 0, 0])), leaves, 1.0, 0.1)
+    assert left.value.motion.sizes["time"] == 5

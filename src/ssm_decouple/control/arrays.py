@@ -103,7 +103,9 @@ def selective_rates(
         )
     rates = _output(out, (n,))
     scale = 1.0 / np.sqrt(weights)
-    if kernel.rates_of(rows, task, velocity, wanted, limits, scale, damping, damping_threshold, rates) != kernel.OK:
+    finite = np.isfinite(rows).all() and np.isfinite(wanted).all()  # rows that are not would protect nothing
+    arguments = (rows, task, velocity, wanted, limits, scale, damping, damping_threshold, rates)
+    if not finite or kernel.rates_of(*arguments) != kernel.OK:
         raise InputError("J_sub, J_task, task_velocity or protected_rate is not finite")
     return rates
 

@@ -1072,4 +1072,4 @@ def _default_weights(robot: Robot, rate_limits: Floats) -> Floats:
     others = np.delete(rate_limits, wheels)
     if wheels and others.size and np.all(np.isfinite([*rate_limits[wheels], others.max()])):
         weights[wheels] = (others.max() / rate_limits[wheels]) ** 2
-    return weights
+    return fixed_array(weights)

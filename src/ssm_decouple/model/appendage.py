@@ -23,6 +23,7 @@ from ssm_decouple.model.urdf import (
     triple,
     write_body,
 )
+from ssm_decouple.settled import FixedArrays
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +40,7 @@ _LARGEST = 1e9  # of any number of an appendage, SI: beyond it squares and cubes
 
 
 @dataclass(frozen=True)
-class Appendage:
+class Appendage(FixedArrays):
     """A solar wing or another flat plate that bends out of its plane.
 
     The plate has uniform area density and no thickness. It is cut across its span into equal segments, each a rigid
@@ -269,7 +270,7 @@ def _frozen(values: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class Modes:
+class Modes(FixedArrays):
     """Clamped bending modes of a robot's appendages.
 
     Mode j, at rest and for small motion, obeys

@@ -30,7 +30,11 @@ ATTRIBUTES = {
     "parent": ("link",),
     "child": ("link",),
 }
+# A unit or a scale changes what every number beside it means; URDF has none.
+_UNITS = ("unit", "units", "scale", "degrees")
 _STRICT = ("origin", "mass", "inertia", "axis")  # an attribute that is not read changes what the element means
+_ALIASES = {("limit", "min"): "lower", ("limit", "max"): "upper"}
+_NUMBERS = {key for keys in ATTRIBUTES.values() for key in keys} - {"link", "joint"}  # none of a link or joint itself
 _WORDS = {word for words in _ONCE.values() for word in words} | {"link", "joint"}
 
 
@@ -43,11 +47,18 @@ def _faults(root: ET.Element) -> Iterator[tuple[str, str]]:
     if not root.get("name"):
         yield "robot", 'has no name: write <robot name="..">'
     yield from _stray(root, "robot")
+    yield from _units(root, "robot")
     for element in root:
         if element.tag not in ("link", "joint"):
-            meant = _meant(element.tag, ("link", "joint"))
-            if meant or element.tag in _WORDS:
-                yield "robot", f"<{element.tag}> is not read there" + (f": write <{meant}>" if meant else "")
+            tag = _local(element.tag)
+            meant = _meant(tag, ("link", "joint"))
+            if meant or tag in _WORDS:
+                mend = f": write <{meant}>, without a prefix" if meant else ""
+                yield "robot", f"<{tag}> is not read there{mend}"
+            elif tag == "include":
+                yield "robot", "<include> is not followed: put what it includes into the file"
+            else:
+                yield from _buried(element, "robot", ("inertial",))
             continue
         where = f"{element.tag} {element.get('name')}"
         if not element.get("name"):
@@ -67,13 +78,19 @@ def _contents(element: ET.Element, where: str) -> Iterator[tuple[str, str]]:
     """Check what stands directly in a link, an <inertial> or a joint."""
     once = _ONCE[element.tag]
     yield from _stray(element, where)
-    tags = [child.tag for child in element]
+    yield from _units(element, where)
+    tags = [_local(child.tag) for child in element]
+    for key in element.attrib:
+        if _local(key) in _NUMBERS:
+            yield where, f"<{element.tag} {_local(key)}=..> is not read: it belongs in an element inside"
     for tag in dict.fromkeys(tags):
         count = tags.count(tag)
-        if tag in once and count > 1:
+        if tag in once and element.find(tag) is None:
+            yield where, f"<{tag}> has a namespace and is not read: write <{tag}> without a prefix"
+        elif tag in once and count > 1:
             yield where, f"has {count} <{tag}>, of which one would be read; keep one"
         elif tag not in once and tag not in _OTHERS[element.tag]:
-            meant = _meant(tag, (*once, *_OTHERS[element.tag]))
+            meant = "origin" if tag == "pose" else _meant(tag, (*once, *_OTHERS[element.tag]))
             if meant:
                 yield where, f"<{tag}> is not read: write <{meant}>"
             elif tag in _WORDS and not all(_is_identity(child) for child in element.findall(tag)):
@@ -81,6 +98,30 @@ def _contents(element: ET.Element, where: str) -> Iterator[tuple[str, str]]:
     for child in element:
         if child.tag in ATTRIBUTES and child.tag in once:
             yield from _leaf(child, where)
+        elif child.tag not in once and child.tag != "left_out":
+            shape = child.tag in ("visual", "collision", "contact", "self_filter", "sensor")
+            yield from _buried(child, where, ("inertial",) if shape else once)
+
+
+def _local(name: object) -> str:
+    """Return the name of an element or attribute without its namespace."""
+    return str(name).rpartition("}")[2]
+
+
+def _buried(element: ET.Element, where: str, words: tuple[str, ...]) -> Iterator[tuple[str, str]]:
+    """Say what would be lost with an element that is not read."""
+    for inner in element.iter():
+        if inner is not element and _local(inner.tag) in words:
+            tag = _local(inner.tag)
+            yield where, f"<{tag}> inside of <{_local(element.tag)}> is not read; put it where URDF has it"
+            return
+
+
+def _units(element: ET.Element, where: str) -> Iterator[tuple[str, str]]:
+    for key in element.attrib:
+        if _local(key) in _UNITS:
+            tag = element.tag
+            yield where, f"<{tag} {_local(key)}=..> is not read: URDF has m, kg, s and rad; write numbers in these"
 
 
 def _is_identity(element: ET.Element) -> bool:
@@ -92,10 +133,13 @@ def _is_identity(element: ET.Element) -> bool:
 def _leaf(leaf: ET.Element, where: str) -> Iterator[tuple[str, str]]:
     """Check the attributes of an element that has nothing else."""
     known = ATTRIBUTES[leaf.tag]
+    yield from _units(leaf, where) if leaf.tag not in _STRICT else ()
     for key in leaf.attrib:
+        if key.startswith("{") and _local(key) in known and _local(key) not in leaf.attrib:
+            yield where, f"<{leaf.tag} {_local(key)}=..> has a namespace and is not read: write it without a prefix"
         if key in known or key.startswith("{"):
             continue
-        meant = _meant(key, tuple(word for word in known if word not in leaf.attrib))
+        meant = _ALIASES.get((leaf.tag, key)) or _meant(key, tuple(word for word in known if word not in leaf.attrib))
         if meant:
             yield where, f"<{leaf.tag} {key}=..> is not read: write {meant}"
         elif leaf.tag in _STRICT:
@@ -169,6 +213,8 @@ def _unreadable(where: str, tag: str, key: str, given: str, finite: bool = False
     endless = {"lower": math.inf, "upper": -math.inf, "effort": -math.inf, "velocity": -math.inf}
     if tag != "mass" and tag != "inertia" and (math.isnan(value) or value == endless.get(key)):
         yield where, f'<{tag} {key}="{_short(given)}"> needs a number'
+    elif key in ("effort", "velocity") and value < 0:
+        yield where, f'<{tag} {key}="{_short(given)}"> is negative; a limit is a size, or is left out'
     elif finite and not math.isfinite(value):
         yield where, f'<{tag} {key}="{_short(given)}"> needs a finite number'
 

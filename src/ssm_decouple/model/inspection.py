@@ -131,6 +131,10 @@ def _inspect_joint(joint: ET.Element) -> Iterator[Finding]:
         yield Finding("suspicious", where, f"a {kind} joint without <limit> has no limits; {advice}")
     else:
         yield from _inspect_limit(joint, where, kind, limit)
+    soft = joint.find("safety_controller")
+    if soft is not None and ("soft_lower_limit" in soft.attrib or "soft_upper_limit" in soft.attrib):
+        ends = " to ".join(soft.get(f"soft_{key}_limit", "0") for key in ("lower", "upper"))
+        yield Finding("note", where, f"its soft limits {ends} are not kept; those of <limit> are")
     dynamics = joint.find("dynamics")
     if dynamics is not None and dynamics.get("damping") is None and dynamics.get("friction") is None:
         yield Finding("note", where, "its <dynamics> is empty, which other readers refuse; it is left out")
@@ -140,7 +144,7 @@ def _inspect_limit(joint: ET.Element, where: str, kind: str, limit: ET.Element) 
     limits = JointLimits.of(joint)
     if kind == "continuous":
         lower, upper = (number(limit.get(key, "0")) for key in ("lower", "upper"))
-        if lower < upper:
+        if lower != upper:
             message = f"its limits {lower:g} to {upper:g} are not kept: a continuous joint turns without end"
             yield Finding("suspicious", where, f"{message}; make it revolute, or leave them out")
     elif np.isinf(limits.lower) and np.isinf(limits.upper):
@@ -156,10 +160,8 @@ def _inspect_limit(joint: ET.Element, where: str, kind: str, limit: ET.Element) 
     if not 0 < limits.velocity < np.inf:
         message = "no velocity limit above zero" if limits.velocity <= 0 else "its <limit> gives no velocity limit"
         yield Finding("suspicious", where, f"{message}: give the law a rate_limit")
-    if not 0 <= limits.effort < np.inf:
-        negative = limits.effort < 0
-        message = f"its effort limit {limits.effort:g} is negative and means none" if negative else "no effort limit"
-        yield Finding("suspicious" if negative else "note", where, message)
+    if np.isinf(limits.effort):
+        yield Finding("note", where, "no effort limit")
     if kind != "prismatic":
         yield from _inspect_degrees(joint, where, limits)
 

@@ -13,6 +13,7 @@ from ssm_decouple.model.urdf import Body, write_body
 
 Floats = NDArray[np.float64]
 
+_MOST = 1e100  # kg m2: the squares of larger ones leave the range of numbers
 _THIN = 1e-9  # a flat body is at the edge of the triangle inequality: rounding must not push it over
 
 
@@ -45,7 +46,7 @@ def possible_inertia(name: str, inertia: ArrayLike) -> Floats:
         ModelError: no body has it: a principal moment is not positive, or larger than the sum of the others.
     """
     matrix = as_floats(name, inertia)
-    if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
+    if matrix.shape != (3, 3) or not np.all(np.abs(matrix) < _MOST):
         raise InputError(
             f"{name} is {shown(matrix.tolist())}; it needs (3, 3) finite numbers, kg m2, about the centre of mass"
         )

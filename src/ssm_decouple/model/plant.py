@@ -16,14 +16,14 @@ from ssm_decouple.errors import DecoupleWarning, InputError, as_floats
 from ssm_decouple.model.appendage import Appendage, flexible_urdf
 from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.model.urdf import parse_urdf
-from ssm_decouple.settled import fixed_array
+from ssm_decouple.settled import FixedArrays, fixed_array
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Plant:
+class Plant(FixedArrays):
     """A robot whose appendages bend, beside the rigid robot that the control law sees.
 
     Attributes:

@@ -486,7 +486,10 @@ class Robot(Settled):
                 f"velocity needs {self.model.nv} finite numbers: base twist (6), joint rates ({self.n_joints})"
             )
         pin.computeCentroidalMomentum(self.model, self._data, from_base(self.checked(q)), velocity)
-        return np.array(self._data.hg.vector)
+        momentum = np.array(self._data.hg.vector)
+        if not np.all(np.isfinite(momentum)):
+            raise InputError(f"velocity is {shown(velocity.tolist())}; its momentum is beyond the largest number")
+        return momentum
 
     @property
     def wheel_inertias(self) -> Floats:

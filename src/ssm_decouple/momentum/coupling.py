@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ssm_decouple.errors import InputError, as_floats, as_text, shown
 from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum import metrics
+from ssm_decouple.settled import FixedArrays
 
 if TYPE_CHECKING:
     from ssm_decouple.momentum.protection import Protection
@@ -20,7 +21,7 @@ Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Coupling:
+class Coupling(FixedArrays):
     """How joint rates and base motion share momentum at one configuration, at zero total momentum.
 
     Immutable: every array is read-only. The paper is Choi and Kim, AAS 26-723.

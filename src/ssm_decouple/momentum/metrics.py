@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.errors import InputError, as_floats, as_positive
 from ssm_decouple.momentum.protection import Protection, checked_protection
+from ssm_decouple.settled import FixedArrays
 
 if TYPE_CHECKING:
     from ssm_decouple.momentum.coupling import Coupling
@@ -20,7 +21,7 @@ ROUNDING = 64 * np.finfo(float).eps  # a semi-axis below this share of the large
 
 
 @dataclass(frozen=True)
-class Ellipsoid:
+class Ellipsoid(FixedArrays):
     """What a map makes of all joint rates with |q_dot| <= 1: an ellipsoid, by singular value decomposition.
 
     map @ joint_rates = directions * semi_axes. Where joints turn and slide both, |q_dot| mixes rad/s and m/s.

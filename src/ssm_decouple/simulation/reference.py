@@ -155,6 +155,8 @@ class TumblingTarget(Settled):
         self._prepare(float(np.linalg.norm(self.angular_momentum) * np.linalg.norm(self._inverse, 2)))
 
     def _prepare(self, fastest: float) -> None:
+        if not fastest < np.inf:
+            raise InputError("target angular_velocity: its angular momentum is beyond the largest number")
         quaternion = pin.Quaternion(self._start.rotation).normalized().coeffs()
         step = 2 * np.pi / (_STEPS_A_TURN * fastest) if fastest > 0 else np.inf
         self._solver = DOP853(self._slope, 0.0, quaternion, np.inf, max_step=step, rtol=1e-13, atol=1e-15)

@@ -172,7 +172,7 @@ def simulate(
             "a shorter physics step or a softer servo",
             run.record(),
         ) from None
-    except Exception as error:
+    except BaseException as error:  # sys.exit in a user's function and the like among them
         if run.done:
             _give_motion(error, run)
         raise
@@ -269,7 +269,7 @@ class _Run:
         return motion
 
 
-def _give_motion(error: Exception, run: _Run) -> None:
+def _give_motion(error: BaseException, run: _Run) -> None:
     """Attach the motion so far to an error, the user's or ours, that ends it."""
     try:
         error.motion = run.record()  # type: ignore[attr-defined]

@@ -44,7 +44,7 @@ from ssm_decouple.files import is_file
 from ssm_decouple.model.catalogue import load_robot, models
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection, checked_protection
-from ssm_decouple.settled import fixed, fixed_array
+from ssm_decouple.settled import FixedArrays, fixed, fixed_array
 from ssm_decouple.simulation.dynamic import Dynamic, Servo
 from ssm_decouple.simulation.simulate import Progress, simulate
 from ssm_decouple.simulation.steps import STEPS
@@ -136,7 +136,7 @@ _ANY_TASK = {"kind": (TEXT, True), "gain": (NUMBER, False), "weight": (NUMBER, F
 
 
 @dataclass(frozen=True)
-class Case:
+class Case(FixedArrays):
     """One motion to simulate. Units are SI and radians. What it holds is read-only: `dataclasses.replace` changes it.
 
     Attributes:
