@@ -162,6 +162,14 @@ def test_a_schedule_by_state_sees_true_positions(ets_vii):
     assert np.abs(motion.protected_rate.values[motion.protection_share.values[:, 0] == 1.0]).max() < 1e-17
 
 
+def test_a_schedule_by_time_far_away_is_the_one_near_the_origin(ets_vii):
+    law = ssm.ScheduledLaw(ets_vii, ssm.Schedule([(0.0, "none"), (2.0, "yaw")], hand_over=1.0), gain=0.05)
+    q, place = ets_vii.configuration(START), FAR[1]
+    near, far = (ssm.simulate(law, at(q, there), TARGET + there, 5.0, 0.1) for there in (np.zeros(3), place))
+    np.testing.assert_allclose(far.joint_rates.values, near.joint_rates.values, atol=1e-12)
+    np.testing.assert_array_equal(far.protection_share.values, near.protection_share.values)
+
+
 def test_momentum_and_distances_do_not_depend_on_the_place(ets_vii, rng):
     for place in FAR:
         q, v = some_state(ets_vii, rng), rng.normal(size=12)

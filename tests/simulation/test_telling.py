@@ -17,7 +17,7 @@ from ssm_decouple.simulation.telling import REVERSALS, reversals, sentences
 
 START = np.deg2rad([150.0, -20, -10, 0, 0, 0])
 TARGET = np.array([-1.8, -0.3, 1.2])
-TOLD = ("protection_lost", "plan_unsettled", "rate_reversals", "wheel_torque_exceeded")
+TOLD = ("protection_lost", "plan_unsettled", "rate_reversals", "acceleration_exceeded", "wheel_torque_exceeded")
 
 
 def run(law, q, target, duration, dt=0.1, method="explicit", **more):
@@ -140,6 +140,28 @@ def test_reversals_of_each_row_of_a_batch(ets_vii, rng):
         motion, _ = run(law, q, TARGET, 60.0, 0.2)
         expected = reversals(motion.joint_rates.values).sum(axis=0).max()
         assert count == pytest.approx(expected, abs=max(2.0, 0.3 * expected))
+
+
+def test_acceleration_limits_that_give_way_to_the_protection_are_told():
+    """Case 2 at 0.1 deg/s2: the command as a whole exceeds it, joint by joint it is kept."""
+    case, limit = ssm.load_case("case2"), np.deg2rad(0.1)
+    for limits in (None, ssm.Limits()):
+        options = {"sample_time": 0.1, "acceleration_limit": limit, "limits": limits}
+        law = ssm.SelectiveLaw(case.robot, case.protection, gain=0.05, rate_limit=np.deg2rad(5.0), **options)
+        motion, told = run(law, case.start(), case.target, 150.0, method="held")
+        taken = np.abs(np.diff(motion.joint_rates.values, axis=0, prepend=0.0)) / 0.1
+        beyond = taken > limit * (1 + 1e-6)
+        assert ("acceleration_exceeded" in motion.attrs) == beyond.any() == (limits is None)
+        if limits is None:
+            found = json.loads(motion.attrs["acceleration_exceeded"])
+            assert set(found["joints"]) == {
+                name for name, any_ in zip(law.robot.joint_names, beyond.any(0), strict=True) if any_
+            }
+            for name, joint in found["joints"].items():
+                assert joint["largest"] == pytest.approx(taken[:, law.robot.joint_index(name)].max(), rel=1e-12)
+                assert joint["limit"] == limit
+            assert sum(end - start for start, end in found["spans"]) == pytest.approx(0.1 * beyond.any(1)[:-1].sum())
+            assert "acceleration limits are exceeded" in " ".join(told)
 
 
 def wheeled(robot):

@@ -249,7 +249,7 @@ class ScheduledLaw(SelectiveLaw):
         Its schedule goes on to look at the true ones; the scratch memory of both laws is one.
         """
         seen = copy.copy(self)
-        seen.schedule = self.schedule.seen_from(origin)
+        object.__setattr__(seen, "schedule", self.schedule.seen_from(origin))  # a copy that is being made
         return seen
 
     def lost_direction(self, q: ArrayLike) -> LostDirection:

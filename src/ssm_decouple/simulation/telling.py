@@ -28,6 +28,8 @@ SETTLED = (
 )
 TORQUE_SHARE = 1.01  # of a motor's torque: an acceleration limit of the wheel leaves out what the base's own takes
 
+EXCEEDED = 1e-9  # of an acceleration limit: less beyond it is rounding
+
 
 def reversals(joint_rates: Floats) -> NDArray[np.bool_]:
     """Say at which samples which joint's rate reverses once more: there, back and there again in three steps (m, n).
@@ -43,6 +45,16 @@ def reversals(joint_rates: Floats) -> NDArray[np.bool_]:
     return found
 
 
+def accelerations(time: Floats, joint_rates: Floats) -> Floats:
+    """Return the acceleration (m, n), rad/s2 or m/s2, of each commanded change of rates, the first one from rest.
+
+    Args:
+        time: Sample times (m,), s.
+        joint_rates: Commanded rates (m, n), rad/s or m/s.
+    """
+    return np.diff(joint_rates, axis=0, prepend=0.0) / _holds(time)[:, None]
+
+
 def wheel_torques(law: SelectiveLaw, time: Floats, start: Floats, stored: Floats) -> Floats:
     """Return the torque (m, wheels), N m, that would bring each wheel's momentum to that of a sample within its hold.
 
@@ -56,8 +68,7 @@ def wheel_torques(law: SelectiveLaw, time: Floats, start: Floats, stored: Floats
     turning = law.base_twist(start, np.zeros(robot.n_joints))[3:]
     axes = [np.ravel(robot.model.joints[robot.model.getJointId(name)].createData().S)[3:] for name in robot.wheel_names]
     before = robot.wheel_inertias * (np.array(axes) @ turning)
-    holds = np.diff(time, append=2 * time[-1] - time[-2]) if time.size > 1 else np.ones(1)
-    return np.diff(np.vstack([before, stored]), axis=0) / holds[:, None]
+    return np.diff(np.vstack([before, stored]), axis=0) / _holds(time)[:, None]
 
 
 def tell(motion: xr.Dataset, law: SelectiveLaw, values: Floats, start: Floats, dynamic: bool) -> dict[str, str]:
@@ -93,6 +104,10 @@ def tell(motion: xr.Dataset, law: SelectiveLaw, values: Floats, start: Floats, d
             "joints": {name: int(count) for name, count in zip(law.robot.joint_names, counts, strict=True) if count},
             "spans": [[float(time[where[0]]), float(time[where[-1]])]],
         }
+    if law.acceleration_limits is not None:
+        exceeded = _exceeded(time, motion.joint_rates.values, law)
+        if exceeded:
+            told["acceleration_exceeded"] = exceeded
     if law.robot.wheel_names and not dynamic:
         needed = wheel_torques(law, time, start, motion.wheel_momentum.values)
         limits = law.robot.wheel_torques
@@ -115,6 +130,21 @@ def sentences(motion: xr.Dataset) -> list[str]:
     """Return in words what `tell` has found, one sentence each; none of a motion that kept all."""
     found = {name: json.loads(motion.attrs[name]) for name in _WORDS if name in motion.attrs}
     return [_WORDS[name](told) for name, told in found.items()]
+
+
+def _exceeded(time: Floats, joint_rates: Floats, law: SelectiveLaw) -> dict[str, Any]:
+    """Return what is told of acceleration limits that the commanded rates exceed; nothing where they keep them."""
+    limits, found = law.acceleration_limits, np.abs(accelerations(time, joint_rates))
+    rounding = 4 * kernel.EPS * np.abs(joint_rates).max(axis=1, keepdims=True) / _holds(time)[:, None]
+    beyond = found > (1.0 + EXCEEDED) * limits + rounding
+    if not beyond.any():
+        return {}
+    joints = {
+        name: {"largest": float(found[:, i].max()), "limit": float(limits[i])}
+        for i, name in enumerate(law.robot.joint_names)
+        if beyond[:, i].any()
+    }
+    return {"joints": joints, "spans": _spans(time, beyond.any(axis=1))}
 
 
 def _lost(told: dict[str, Any]) -> str:
@@ -142,6 +172,16 @@ def _reversed(told: dict[str, Any]) -> str:
     )
 
 
+def _too_fast(told: dict[str, Any]) -> str:
+    name, joint = max(told["joints"].items(), key=lambda item: item[1]["largest"] / item[1]["limit"])
+    others = f", and {len(told['joints']) - 1} other joints theirs" if len(told["joints"]) > 1 else ""
+    return (
+        f"acceleration limits are exceeded {_listed(told['spans'])}, for what comes before them, such as the "
+        f"protection: {name} takes {joint['largest']:.3g} of {joint['limit']:.3g} rad/s2 (or m/s2){others}; "
+        "limits=Limits() brakes ahead, and lower rate limits need less"
+    )
+
+
 def _too_weak(told: dict[str, Any]) -> str:
     each = ", ".join(f"{name} {wheel['needed']:.3g} of {wheel['limit']:.3g} N m" for name, wheel in told.items())
     return (
@@ -154,8 +194,15 @@ _WORDS = {
     "protection_lost": _lost,
     "plan_unsettled": _unsettled,
     "rate_reversals": _reversed,
+    "acceleration_exceeded": _too_fast,
     "wheel_torque_exceeded": _too_weak,
 }
+
+
+def _holds(time: Floats) -> Floats:
+    """Return for how long each sample's command is held (m,), s; the last as long as the one before it."""
+    holds: Floats = np.diff(time, append=2 * time[-1] - time[-2]) if time.size > 1 else np.ones(1)
+    return holds
 
 
 def _listed(spans: list[list[float]]) -> str:
