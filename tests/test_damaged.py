@@ -326,6 +326,9 @@ def test_what_happens_to_a_store_is_noticed_and_mended(campaign, whole, tmp_path
             (store / "zarr.json").write_text(text[: len(text) // 2])
     with pytest.raises(ssm.FileError, match=r"'ssm-decouple campaign verify .*--resume' computes it again"):
         Store.open(store).dataset().load()
+    if "description" in harm:
+        with pytest.raises(ssm.FileError, match="can list nothing else until"):
+            Store.open(store)
     if "description" not in harm:
         kept = Store.open(store)
         assert any("chunk 1 (samples 3 to 5): " in fault for fault in kept.damage())
