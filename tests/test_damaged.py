@@ -400,6 +400,17 @@ def test_the_order_of_writing_outlasts_a_power_cut(campaign, tmp_path, monkeypat
 # Motions.
 
 
+@pytest.mark.parametrize("harm", ["a byte", "the end"])
+def test_a_damaged_motion_is_refused_with_what_mends_it(tmp_path, motion, harm):
+    path = tmp_path / "motion.nc"
+    ssm.save_motion(motion, path)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content if harm == "a byte" else content[: len(content) // 2])
+    with pytest.raises(ssm.FileError, match=r"is damaged: .*; compute the motion again, or take an undamaged copy"):
+        ssm.load_motion(path)
+
+
 @pytest.mark.parametrize("name", ["folder", "empty", "text", "loop", "nothing", "n" * 300, "nul\0"])
 def test_what_is_no_file_of_a_motion_is_refused(tmp_path, name):
     (tmp_path / "folder").mkdir()
