@@ -326,6 +326,9 @@ def test_what_happens_to_a_store_is_noticed_and_mended(campaign, whole, tmp_path
             (store / "zarr.json").write_text(text[: len(text) // 2])
     with pytest.raises(ssm.FileError, match=r"'ssm-decouple campaign verify .*--resume' computes it again"):
         Store.open(store).dataset().load()
+    if "description" in harm:
+        with pytest.raises(ssm.FileError, match="can list nothing else until"):
+            Store.open(store)
     if "description" not in harm:
         kept = Store.open(store)
         assert any("chunk 1 (samples 3 to 5): " in fault for fault in kept.damage())
@@ -395,6 +398,17 @@ def test_the_order_of_writing_outlasts_a_power_cut(campaign, tmp_path, monkeypat
 
 
 # Motions.
+
+
+@pytest.mark.parametrize("harm", ["a byte", "the end"])
+def test_a_damaged_motion_is_refused_with_what_mends_it(tmp_path, motion, harm):
+    path = tmp_path / "motion.nc"
+    ssm.save_motion(motion, path)
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 1
+    path.write_bytes(content if harm == "a byte" else content[: len(content) // 2])
+    with pytest.raises(ssm.FileError, match=r"is damaged: .*; compute the motion again, or take an undamaged copy"):
+        ssm.load_motion(path)
 
 
 @pytest.mark.parametrize("name", ["folder", "empty", "text", "loop", "nothing", "n" * 300, "nul\0"])

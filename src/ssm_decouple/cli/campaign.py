@@ -41,7 +41,6 @@ campaign = typer.Typer(
 )
 
 StorePath = Annotated[Path, typer.Argument(metavar="STORE", help="Folder of the campaign's store.")]
-MEND = "'ssm-decouple campaign run FILE --output STORE --resume' computes it again"
 LOG_EVERY = 30.0  # s between lines where there is no terminal
 
 
@@ -113,7 +112,7 @@ def status(store: StorePath, as_json: AsJson = False) -> None:
     for fault in found.damaged:
         typer.echo(f"damaged: {fault}")
     if found.damaged:
-        typer.echo(MEND)
+        typer.echo(_mend(store))
 
 
 @campaign.command()
@@ -133,7 +132,7 @@ def verify(store: StorePath, as_json: AsJson = False) -> None:
         for fault in faults:
             typer.echo(f"damaged: {fault}")
         how = "as they were written" if found.checked else "readable; without checksums no more can be said"
-        typer.echo(MEND if faults else f"{there.sum()} of {len(there)} samples are there, all {how}")
+        typer.echo(_mend(store) if faults else f"{there.sum()} of {len(there)} samples are there, all {how}")
     if faults:
         raise typer.Exit(1)
 
@@ -220,6 +219,10 @@ def rerun(
         typer.echo(f"the motion is in {path}")
 
 
+def _mend(store: Path) -> str:
+    return f"'ssm-decouple campaign run FILE --output {store} --resume' computes it again"
+
+
 def _whole(path: Path) -> Store:
     """Return a store of which nothing is damaged: what is not is no matter for statistics.
 
@@ -234,7 +237,7 @@ def _whole(path: Path) -> Store:
         more = f", and {len(faults) - 1} more" if faults[1:] else ""
         raise FileError(
             f"'{path}' is damaged: {faults[0]}{more}. 'ssm-decouple campaign verify {path}' lists all that is, and "
-            f"'ssm-decouple campaign run FILE --output {path} --resume' computes it again"
+            f"{_mend(path)}"
         )
     return found
 

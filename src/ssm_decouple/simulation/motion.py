@@ -472,6 +472,7 @@ def load_motion(path: str | Path) -> xr.Dataset:
 
 
 _SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_AGAIN = "compute the motion again, or take an undamaged copy of the file"
 _SEAL = b"\nssm-decouple sha256 "  # between HDF5's end and the digest
 _DIGEST = 64 + 1  # characters, with the line's end
 _CHUNK = 2**17  # numbers that carry one checksum
@@ -519,10 +520,10 @@ def _verify(path: Path) -> bool:
         seal = file.read()
         if seal.startswith(_SEAL):
             if _sha256(file, whole) != seal[len(_SEAL) : -1]:
-                raise FileError(f"'{path}' is damaged: its bytes are not those that were written")
+                raise FileError(f"'{path}' is damaged: its bytes are not those that were written; {_AGAIN}")
             return True
         if _hdf5_end(head) not in (None, size):
-            raise FileError(f"'{path}' is damaged: its end is not where it was written")
+            raise FileError(f"'{path}' is damaged: its end is not where it was written; {_AGAIN}")
     _refuse_absurd(path, size)
     return False
 
@@ -557,7 +558,8 @@ def _refuse_absurd(path: Path, size: int) -> None:
         claimed: list[int] = []
         file.visititems(lambda _, item: claimed.append(item.nbytes if isinstance(item, h5py.Dataset) else 0))
     if sum(claimed) > _DEFLATED * size:
-        raise FileError(f"'{path}' is damaged: it claims to hold {sum(claimed) / 1e9:.3g} GB in {size / 1e6:.3g} MB")
+        held = f"{sum(claimed) / 1e9:.3g} GB in {size / 1e6:.3g} MB"
+        raise FileError(f"'{path}' is damaged: it claims to hold {held}; {_AGAIN}")
 
 
 def _refuse_other(motion: xr.Dataset, path: str | Path) -> None:

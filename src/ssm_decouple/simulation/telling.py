@@ -151,8 +151,8 @@ def _lost(told: dict[str, Any]) -> str:
     why = "; ".join(told["why"]) or "they could not be met"
     momentum = ", for the momentum on board" if any(told["momentum"]) else ""
     return (
-        f"the protected directions do not get the rate that they shall have {_listed(told['spans'])}: it is up to "
-        f"{told['largest_rate']:.2g} rad/s off, at {told['at']:g} s; {why}{momentum}"
+        f"the protection is not kept {_listed(told['spans'])}: the protected rate is up to {told['largest_rate']:.2g} "
+        f"rad/s off, at {told['at']:g} s; {why}{momentum}"
     )
 
 

@@ -635,7 +635,11 @@ class _BrokenError(FileError):
     """
 
     def __init__(self, folder: Path, fault: str) -> None:
-        super().__init__(_damaged(folder, fault))
+        super().__init__(
+            f"'{folder}' is damaged, or its run was stopped right at the start: {fault}. 'ssm-decouple campaign verify "
+            f"{folder}' can list nothing else until 'ssm-decouple campaign run FILE --output {folder} --resume' "
+            f"computes it again"
+        )
         self.fault = fault
 
 
