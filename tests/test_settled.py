@@ -55,3 +55,10 @@ def test_a_task_takes_no_attribute_that_it_has_not(task):
     for name in ("gian", "takes_target", "gain"):
         with pytest.raises(FrozenInstanceError):
             setattr(task, name, 1.0)
+
+
+def test_the_text_of_a_urdf_is_no_path():
+    robot = ssm.load_robot("ets_vii")
+    with pytest.raises(ssm.InputError, match=r"Robot\(text") as refusal:
+        ssm.load_robot(robot.urdf)
+    assert len(str(refusal.value)) < 400

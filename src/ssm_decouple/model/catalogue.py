@@ -12,7 +12,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, as_path, as_text, unknown
+from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, as_path, as_text, shown, unknown
 from ssm_decouple.files import is_file
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.formats import read_robot
@@ -65,6 +65,8 @@ def find_robot(source: str | Path) -> Path:
         InputError: it is no text and no path.
     """
     catalogue = models()
+    if isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<"):
+        raise InputError(f"robot is {shown(source)}; that is the text of a URDF: give Robot(text, name='..') that")
     path = as_path("robot", source, f"give a path, or a name of the catalogue ({', '.join(catalogue)})")
     if str(source) in catalogue:
         return catalogue[str(source)]

@@ -103,7 +103,9 @@ class Protection(Settled):
         try:
             given = as_floats("participation", participation)
         except InputError:
-            raise InputError(f"participation vectors cannot be read as numbers: {shown(participation)}") from None
+            raise InputError(
+                f"participation vectors cannot be read as numbers: {shown(participation)}; give modes.participation"
+            ) from None
         columns = given[:, None] if given.ndim == 1 else given
         if columns.ndim != 2 or columns.shape[0] != 6:
             raise InputError(

@@ -149,10 +149,12 @@ class TumblingTarget(Settled):
         self._grasp = as_triple("target grasp_point", grasp_point)
         spin = as_triple("target angular_velocity", angular_velocity)
         R = self._start.rotation
-        self.angular_momentum: Floats = fixed_array(R @ self._inertia @ R.T @ spin)
         self._inverse = np.linalg.inv(self._inertia)
+        with np.errstate(over="ignore", invalid="ignore"):  # looked at below
+            self.angular_momentum: Floats = fixed_array(R @ self._inertia @ R.T @ spin)
+            fastest = float(np.linalg.norm(self.angular_momentum) * np.linalg.norm(self._inverse, 2))
         self._momentum, self._half_inverse = self.angular_momentum.tolist(), (0.5 * self._inverse).tolist()
-        self._prepare(float(np.linalg.norm(self.angular_momentum) * np.linalg.norm(self._inverse, 2)))
+        self._prepare(fastest)
 
     def _prepare(self, fastest: float) -> None:
         if not fastest < np.inf:
