@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 import ssm_decouple as ssm
+from ssm_decouple.simulation import steps
 from ssm_decouple.simulation.replay import integral_along, rates_along
 
 START = np.deg2rad([150, -20, -10, 10, 20, -30])
@@ -381,3 +382,24 @@ def test_who_follows_a_moving_target_is_not_stalled(ets_vii):
     # An arm that cannot move any more while its target goes on has stalled.
     stuck = ssm.SelectiveLaw(ets_vii, ssm.Protection("yaw"), gain=0.1, rate_limit=1e-7)
     assert ssm.simulate(stuck, q, target, 60.0, 0.1).attrs["outcome"] == "stalled"
+
+
+@pytest.mark.parametrize("momentum", [None, [3.0, 0, 1, 2, 0, 8.0]])
+@pytest.mark.parametrize("frame", ["base", "inertial"])
+def test_long_holds_are_moved_as_truly_as_short_ones(ets_vii, momentum, frame):
+    """What is held for 20 s, in which joints turn by 1.7 rad, is what twenty holds of 1 s make of the same rates."""
+    q, law = ets_vii.configuration(START), ssm.SelectiveLaw(ets_vii, ssm.Protection("yaw", frame), momentum=momentum)
+    rates = 0.087 * np.array([1.0, -0.5, 0.8, 1.0, -1.0, 0.3])
+
+    def velocity(q):
+        return np.r_[law.base_twist(q, rates), rates]
+
+    at, moved = q, np.zeros((2, 6))
+    for _ in range(400):
+        at, more = steps.hold_rates(law, at, velocity(at), 0.05)
+        moved += more
+    end, whole = steps.hold_rates(law, q, velocity(q), 20.0)
+    np.testing.assert_allclose(end, at, atol=2e-9)
+    np.testing.assert_allclose(whole, moved, atol=2e-9)
+    with pytest.raises(ssm.InputError, match="rad in the 1e\\+09 s for which a command is held"):
+        steps.hold_rates(law, q, velocity(q), 1e9)

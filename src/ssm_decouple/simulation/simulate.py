@@ -107,8 +107,8 @@ def simulate(
         warning each: `protection_lost` (the protected rate is not what was asked for: from when to when, how much,
         why), `plan_unsettled` (planning for the hold has not settled), `rate_reversals` (joints whose commanded rates
         alternate from sample to sample), `acceleration_exceeded` (joints whose commanded rates change faster than the
-        law's acceleration limits, for what comes before these) and, of kinematic motions, `wheel_torque_exceeded` (wheels that would need
-        more torque than their motors have). Of a stalled motion
+        law's acceleration limits, for what comes before these) and, of kinematic motions, `wheel_torque_exceeded`
+        (wheels that would need more torque than their motors have). Of a stalled motion
         `lost_direction` (JSON) says in which direction the tasks of level 1 could
         move least at its end, and how much better that would be without each protected row. With other tasks
         than the end-effector's position there is also `task_error` (time, task_row), m or rad, as the law sees

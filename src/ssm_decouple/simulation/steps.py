@@ -45,6 +45,10 @@ class Demand(NamedTuple):
 Step = Callable[[SelectiveLaw, Demand, Floats, Floats, float, float], tuple[Floats, Floats]]
 Hold = Callable[[SelectiveLaw, Floats, Floats, float], tuple[Floats, Floats]]
 
+# Of joints and base in one piece of a hold, rad (or m): there the sixth-order expansion is good to 1e-10 of an arm's
+# length, and the fourth-order method that momentum on board takes is as good.
+LONGEST, LONGEST_WITH_MOMENTUM = 0.25, 0.05
+MOST_PIECES = 10_000  # of a hold: some seconds
 JUDGING = 5  # Gauss points for integrals over a step, more than any law plans with, so that they judge it
 
 
@@ -74,7 +78,31 @@ def hold_twist(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> tuple[Float
 
 
 def hold_rates(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> tuple[Floats, Floats]:
-    """Hold the joint rates of v (6 + n,); the base follows by a sixth-order Magnus expansion on three Gauss points.
+    """Hold the joint rates of v (6 + n,); the base follows piece by piece, which are short for what they turn.
+
+    Raises:
+        InputError: joints or base turn so far in the hold that it would take more than MOST_PIECES.
+    """
+    longest = LONGEST_WITH_MOMENTUM if law.momentum.any() else LONGEST
+    robot = law.robot
+    wheels = [6 + robot.joint_index(name) for name in robot.wheel_names]  # round about their axes: turning is nothing
+    needed = h * float(np.abs(np.delete(v, wheels)[3:] if wheels else v[3:]).max()) / longest
+    if needed > MOST_PIECES:
+        raise InputError(
+            f"joints or base turn by {needed * longest:.3g} rad in the {h:g} s for which a command is held; take a "
+            "shorter dt"
+        )
+    if needed <= 1.0:
+        return _hold_piece(law, q, v, h)
+    pieces, moved = int(np.ceil(needed)), np.zeros((2, 6))
+    for _ in range(pieces):
+        q, more = _hold_piece(law, q, np.r_[law.base_twist(q, v[6:]), v[6:]], h / pieces)
+        moved += more
+    return q, moved
+
+
+def _hold_piece(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> tuple[Floats, Floats]:
+    """Hold joint rates for a short time: the base follows by a sixth-order Magnus expansion on three Gauss points.
 
     In base axes its twist depends on the joints alone, so the base pose at those points is not needed. The integrals of
     the twist are taken on JUDGING points; in other axes the base is led to each of them by collocation.
