@@ -191,10 +191,13 @@ def as_path(name: str, value: str | os.PathLike[str], mend: str = "give a path, 
 
     Raises:
         InputError: it is none; the message calls it `name` and ends with `mend`.
+        FileError: it has a NUL character in it, which no file's name can have.
     """
     path = os.fspath(value) if isinstance(value, str | os.PathLike) else None
-    if not isinstance(path, str) or not path or "\0" in path:
+    if not isinstance(path, str) or not path:
         raise InputError(f"{name} is {shown(value)}; {mend}")
+    if "\0" in path:
+        raise FileError(f"{name} is {shown(value)}: no file's name has a NUL character in it; leave it out")
     try:
         return Path(path).expanduser()
     except RuntimeError:  # "~stranger"

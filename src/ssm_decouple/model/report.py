@@ -225,7 +225,8 @@ class Report:
         lines = [f"{self.name}: {'can be used' if self.usable else 'cannot be used'}"]
         if self.usable and self.inertia is not None:
             moments = ", ".join(f"{moment:.5g}" for moment in self.inertia)
-            named = f"has to be named: {', '.join(self.tips)}" if self.tips else "none, no joint moves"
+            tips = ", ".join(self.tips)
+            named = f"has to be chosen with end_effector, one of: {tips}" if tips else "none, no joint moves"
             if self.end_effector is not None and self.joints:
                 named = f"{self.end_effector}, reach {self.reach:.4g} m from the arm's first joint"
             lines += [
