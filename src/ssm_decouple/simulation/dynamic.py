@@ -515,10 +515,10 @@ def warn_of_limits(motion: xr.Dataset) -> None:
     """Warn where torque limits have made a good part of what the protected directions have moved.
 
     Warns:
-        DecoupleWarning: it is a tenth or more, and not next to nothing.
+        DecoupleWarning: it is a quarter or more, and not next to nothing.
     """
     largest = np.abs(motion.protected_angle.values).max(initial=0.0)
-    if np.any(_cost_of_limits(motion) > max(0.1 * largest, NEXT_TO_NOTHING)):
+    if np.any(_cost_of_limits(motion) > max(0.25 * largest, NEXT_TO_NOTHING)):
         warnings.warn(
             f"drives at their torque limits have cost protection: {drives_at_limits(motion)}, of "
             f"{np.rad2deg(largest):.2g} deg in all; larger torques help, lower rate or acceleration limits, "

@@ -226,13 +226,13 @@ def _told_of(law: SelectiveLaw) -> dict[str, dict[str, str]]:
     return told
 
 
-def record_bytes(law: SelectiveLaw) -> int:
-    """Return about how much memory a sample of a motion takes: what the law tells, what is recorded, and the way there.
-
-    That of a dynamic motion is counted, too.
-    """
-    kept = 2 * law.size + 4 * law.robot.model.nq + 8 * law.robot.n_joints + 10 * law.directions[0].shape[1]
-    return 8 * (kept + 100)
+def record_bytes(law: SelectiveLaw, dynamic: bool = False) -> int:
+    """Return about how much memory a sample of a motion takes, and what the plant of a dynamic one tells beside it."""
+    nq, n, k = law.robot.model.nq, law.robot.n_joints, law.directions[0].shape[1]
+    numbers = law.size + 3 * nq + 2 * n + 2 * k + 30
+    if dynamic:  # twice, as they come one by one, in arrays of some hundred bytes each
+        numbers += 2 * (nq + 3 * n + 3 * k + 30) + 80
+    return 8 * numbers
 
 
 def build_motion(

