@@ -6,6 +6,7 @@ An attribute is there only where there is something to tell.
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -105,7 +106,7 @@ def tell(motion: xr.Dataset, law: SelectiveLaw, values: Floats, start: Floats, d
             "spans": [[float(time[where[0]]), float(time[where[-1]])]],
         }
     if law.acceleration_limits is not None:
-        exceeded = _exceeded(time, motion.joint_rates.values, law)
+        exceeded = _exceeded(time, motion.joint_rates.values, law.acceleration_limits, law.robot.joint_names)
         if exceeded:
             told["acceleration_exceeded"] = exceeded
     if law.robot.wheel_names and not dynamic:
@@ -132,16 +133,16 @@ def sentences(motion: xr.Dataset) -> list[str]:
     return [_WORDS[name](told) for name, told in found.items()]
 
 
-def _exceeded(time: Floats, joint_rates: Floats, law: SelectiveLaw) -> dict[str, Any]:
+def _exceeded(time: Floats, joint_rates: Floats, limits: Floats, names: Sequence[str]) -> dict[str, Any]:
     """Return what is told of acceleration limits that the commanded rates exceed; nothing where they keep them."""
-    limits, found = law.acceleration_limits, np.abs(accelerations(time, joint_rates))
+    found = np.abs(accelerations(time, joint_rates))
     rounding = 4 * kernel.EPS * np.abs(joint_rates).max(axis=1, keepdims=True) / _holds(time)[:, None]
     beyond = found > (1.0 + EXCEEDED) * limits + rounding
     if not beyond.any():
         return {}
     joints = {
         name: {"largest": float(found[:, i].max()), "limit": float(limits[i])}
-        for i, name in enumerate(law.robot.joint_names)
+        for i, name in enumerate(names)
         if beyond[:, i].any()
     }
     return {"joints": joints, "spans": _spans(time, beyond.any(axis=1))}
