@@ -57,7 +57,7 @@ def medians(candidates: dict[str, Callable[[], object]]) -> dict[str, float]:
 
 
 def plain_numpy(case: ssm.Case, q: Floats) -> Callable[[], Floats]:
-    """Return the paper's law as one writes it from the paper, on the same matrices: `ssm_decouple.control.paper`."""
+    """Return the paper's law as one writes it from the paper, `ssm_decouple.control.paper`; it gives v (6 + n,)."""
     robot, law = case.robot, case.make_law()
     model, data, frame = robot.model, robot.model.createData(), robot.end_effector_id
     U_c, x_des, still = law.protection.U_c, np.array(case.target), np.zeros(3)
@@ -70,7 +70,8 @@ def plain_numpy(case: ssm.Case, q: Floats) -> Callable[[], Floats]:
         J_gt = (J[:, 6:] + J[:, :6] @ J_base)[:3]
         v_cmd = paper.task_velocity(still, law.gain, x_des, data.oMf[frame].translation)
         rates = paper.selective_law(J_base[3:], J_gt, U_c, v_cmd, law.damping, law.damping_threshold)
-        return paper.scaled_to_limits(rates, law.rate_limits)
+        rates = paper.scaled_to_limits(rates, law.rate_limits)
+        return np.concatenate([J_base @ rates, rates])
 
     return step
 
@@ -190,8 +191,8 @@ def main(name: str) -> None:
     candidates["law(q, target), limits by QP"] = lambda: limiting(q, target, previous_rates=at_rest_joints)
     acting = limiting(q, target, previous_rates=at_rest_joints).active_limits
     command = law(q, target)
-    difference = np.abs(plain() - command.joint_rates).max()
-    print(f"{name}, {case.robot.name}, k = {law.protection.k}: plain NumPy differs by {difference:.1e} rad/s")
+    difference = np.abs(plain() - command.velocity).max()
+    print(f"{name}, {case.robot.name}, k = {law.protection.k}: plain NumPy differs by {difference:.1e} m/s and rad/s")
     try:
         pink = pink_step(case, q)
     except ImportError:

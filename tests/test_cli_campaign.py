@@ -87,6 +87,30 @@ def test_a_row_that_was_tampered_with_is_told(call, campaign_file, tmp_path):
     assert "other bits" in call("campaign", "rerun", tmp_path / "s", "5", "-o", tmp_path).stdout
 
 
+def test_damage_is_listed_refused_and_mended(call, campaign_file, tmp_path):
+    words = ("campaign", "run", campaign_file, "-o", "s", "--workers", "1", "--no-progress")
+    assert call(*words, cwd=tmp_path).returncode == 0
+    before = tree(tmp_path / "s")
+    assert "8 of 8 samples are there, all as they were written" in call("campaign", "verify", "s", cwd=tmp_path).stdout
+    (tmp_path / "s" / "outcome" / "c" / "1").unlink()
+    damaged = (tmp_path / "s" / "target" / "c" / "3" / "0").read_bytes()[:-5]
+    (tmp_path / "s" / "target" / "c" / "3" / "0").write_bytes(damaged)
+    listed = ["chunk 1 (samples 2 to 3): outcome/c/1 is lost", "chunk 3 (samples 6 to 7): target/c/3/0 is damaged"]
+    told = call("campaign", "verify", "s", cwd=tmp_path)
+    assert told.returncode == 1
+    assert told.stdout.splitlines()[:2] == [f"damaged: {line}" for line in listed]
+    assert json.loads(call("campaign", "verify", "s", "--json", cwd=tmp_path).stdout)["damaged"] == listed
+    status = json.loads(call("campaign", "status", "s", "--json", cwd=tmp_path).stdout)
+    assert (status["done"], status["left"], status["damaged"]) == (4, 4, listed)
+    for command in ("summary", "plot"):
+        done = call("campaign", command, "s", cwd=tmp_path)
+        assert done.returncode == 1
+        assert f"'s' is damaged: {listed[0]}, and 1 more" in done.stderr
+    done = call(*words, "--resume", cwd=tmp_path)
+    assert done.stderr.splitlines() == [f"damaged, and made again: {line}" for line in listed]
+    assert tree(tmp_path / "s") == before
+
+
 def test_a_sample_that_failed_is_rerun(call, campaign_file, tmp_path, monkeypatch):
     short = campaign_file.with_name("short.toml")
     short.write_text(short.read_text().replace("dt = 0.1", 'dt = 0.1\nmethod = "dynamic"'))
@@ -165,7 +189,7 @@ def test_help_teaches(call):
     shown = call("campaign", "run", "--help").stdout
     assert "--resume" in shown
     assert "Examples:" in shown
-    assert all(word in call("campaign", "--help").stdout for word in ("run", "status", "summary", "rerun"))
+    assert all(word in call("campaign", "--help").stdout for word in ("run", "status", "verify", "summary", "rerun"))
 
 
 def test_the_example_is_a_campaign():

@@ -94,3 +94,16 @@ def test_what_does_not_fit_is_refused(change, says):
 def test_a_map_that_is_none_is_refused(A_g, says):
     with pytest.raises(ssm.InputError, match=says):
         ssm.base_twist_map(A_g)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_protected_rows_that_are_not_finite_are_refused(value):
+    J_sub, J_task = np.array([[0.1, 0.2, 0.3, 0.4]]), np.eye(3, 4)
+    ssm.selective_rates(J_sub, J_task, [0.1, 0.0, 0.0])
+    for column in range(4):
+        damaged = J_sub.copy()
+        damaged[0, column] = value
+        with pytest.raises(ssm.InputError, match="J_sub"):
+            ssm.selective_rates(damaged, J_task, [0.1, 0.0, 0.0])
+    with pytest.raises(ssm.InputError, match="protected_rate"):
+        ssm.selective_rates(J_sub, J_task, [0.1, 0.0, 0.0], protected_rate=[value])

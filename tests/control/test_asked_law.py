@@ -13,6 +13,7 @@ from test_law import exact_residual, kernel_J_sub, planar_robot
 
 import ssm_decouple as ssm
 from ssm_decouple import Protection, SelectiveLaw
+from ssm_decouple.control import kernel
 
 EPS = np.finfo(float).eps
 START = np.deg2rad([150, -20, -10, 0, 0, 0])
@@ -167,7 +168,11 @@ def test_what_cannot_be_met_is_met_as_nearly_as_can_be(write, rng):
                 np.testing.assert_allclose(command.joint_rates, fixed, atol=1e-10 * (1 + np.abs(fixed).max()))
     nothing = SelectiveLaw(flat, Protection(np.eye(6)[:, [2, 3]]))
     q = flat.configuration([0.3, 0.8, -0.6])
-    np.testing.assert_array_equal(nothing(q, [1, 0, 0], protected_rate=[1.0, 2.0]).values, nothing(q, [1, 0, 0]).values)
+    asked, plain = nothing(q, [1, 0, 0], protected_rate=[1.0, 2.0]), nothing(q, [1, 0, 0])
+    told = 6 + flat.n_joints + np.array([kernel.LOST, kernel.LOST_TO])
+    np.testing.assert_array_equal(np.delete(asked.values, told), np.delete(plain.values, told))
+    assert (asked.protection_lost, plain.protection_lost) == (2.0, 0.0)
+    assert asked.protection_lost_to == ("no joint rates give it: J_sub has lost rank",)
 
 
 @pytest.mark.parametrize("k", [1, 2, 4])

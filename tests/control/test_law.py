@@ -229,7 +229,7 @@ def test_the_kernel_uncompiled_gives_the_same(robot, rng, axes):
             plain = np.full(law.size, np.nan)
             model, data, *_, fixed = law._prepared
             pin.computeCentroidalMap(model, data, q)
-            status = uncompiled_command(*fixed, target, velocity, np.zeros(robot.n_joints), plain)
+            status = uncompiled_command(*fixed, target, velocity, np.zeros(robot.n_joints), plain, q)
             assert status == kernel.OK
             np.testing.assert_allclose(plain, compiled, rtol=1e-9, atol=1e-13)
 
@@ -441,7 +441,7 @@ def test_bad_arguments_are_refused(ets_vii):
     stretched[3:7] = [0.9, 0, 0, 1.2]
     with pytest.raises(ssm.InputError, match=r"quaternion q\[3:7\] has length 1.5"):
         law(stretched, [0, 0, 1])
-    with pytest.raises(ssm.InputError, match=r"out must be a writable, contiguous float64 array \(32,\)"):
+    with pytest.raises(ssm.InputError, match=r"out must be a writable, contiguous float64 array \(34,\)"):
         law.evaluate(q, np.zeros(3), np.zeros(3), np.zeros((30, 2))[:, 0])
     with pytest.raises(ssm.InputError, match="out must be"):
         law.evaluate(q, np.zeros(3), np.zeros(3), np.zeros(30, dtype=np.float32))

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import daqp
 import numpy as np
 import pinocchio as pin
@@ -11,7 +13,7 @@ from hypothesis import strategies as st
 from random_robots import random_robot, random_state
 from scipy.optimize import linprog, minimize
 
-from ssm_decouple import InputError, Protection, Robot, load_robot
+from ssm_decouple import DecoupleWarning, InputError, Protection, Robot, SelectiveLaw, load_robot, simulate
 from ssm_decouple.control import limits_kernel as kernel
 from ssm_decouple.control.collision import Clearance
 from ssm_decouple.control.limits import LimitedRates, LimitedStep, Limits
@@ -389,3 +391,82 @@ def test_the_last_bounds_are_tried_first(seed):
             found += kernel.solve_at(H, f, A, high, low, wrong, work, y)
             found += kernel.solve_at(H, f, A, high, low, np.zeros(bounds), work, y)
     assert found == 0
+
+
+@pytest.mark.parametrize("seed", range(9))
+def test_the_return_from_outside_the_limits_throws_no_other_joint(seed):
+    """Random limits and starts outside: hardly any rate changes its sign, and the joints come back."""
+    rng, robot = np.random.default_rng(100 + seed), load_robot("ets_vii")
+    middle, width = rng.uniform(-1.5, 1.5, 6), rng.uniform(0.3, 1.0, 6)
+    start = middle + rng.uniform(-0.9, 0.9, 6) * width
+    outside = rng.choice(6, 1 + seed % 3, replace=False)
+    start[outside] += np.sign(start[outside] - middle[outside]) * (2.0 * width[outside])
+    limits = Limits(np.c_[middle - width, middle + width])
+    law = SelectiveLaw(
+        robot,
+        Protection(["yaw", "roll+yaw", "all"][seed % 3]),
+        rate_limit=RATE,
+        sample_time=DT,
+        acceleration_limit=[None, 0.1][seed % 2],
+        limits=limits,
+    )
+    q = robot.configuration(start)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DecoupleWarning)  # of the start
+        motion = simulate(law, q, robot.frame_pose(q).translation + rng.uniform(-0.6, 0.6, 3), 30.0, DT, "held")
+    rates = motion.joint_rates.values
+    signs = (rates[1:] * rates[:-1] < 0.0) & (np.minimum(np.abs(rates[1:]), np.abs(rates[:-1])) > 1e-3)
+    assert signs.sum(axis=0).max() < 10
+    positions, bounds = motion.joint_positions.values, limits.positions(robot)
+    beyond = np.maximum(positions - bounds[:, 1], bounds[:, 0] - positions).max(axis=1)
+    assert beyond[-1] < 0.95 * beyond[0]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_acceleration_limits_hold_with_weights_where_rows_depend_on_each_other(seed):
+    """A planar arm in an oblique plane, of which the protection asks more rows than J_sub has rank."""
+    rng = np.random.default_rng(seed)
+    normal, joints = rng.normal(size=3), int(rng.integers(3, 6))
+    normal /= np.linalg.norm(normal)
+    along = np.cross(normal, [1.0, 0, 0]) / np.linalg.norm(np.cross(normal, [1.0, 0, 0]))
+
+    def words(vector):
+        return " ".join(map(repr, np.asarray(vector).tolist()))
+
+    links, inertia = [], '<inertia ixx="1" ixy="0" ixz="0" iyy="1" iyz="0" izz="1"/>'
+    for i in range(joints + 1):
+        mass, centre = (50.0, 0.0 * along) if i == 0 else (4.0, 0.3 * along)
+        body = f'<origin xyz="{words(centre)}"/><mass value="{mass}"/>{inertia}'
+        links.append(f'<link name="l{i}"><inertial>{body}</inertial></link>')
+    for i in range(joints):
+        links.append(
+            f'<joint name="j{i}" type="continuous"><parent link="l{i}"/><child link="l{i + 1}"/>'
+            f'<origin xyz="{words(0.7 * along)}"/><axis xyz="{words(normal)}"/></joint>'
+        )
+    robot = Robot(f'<robot name="planar">{"".join(links)}</robot>', name="planar")
+    weights = rng.uniform(0.2, 5.0, joints)
+    law = SelectiveLaw(
+        robot,
+        Protection("all"),
+        gain=1.0,
+        rate_limit=0.02,
+        sample_time=DT,
+        acceleration_limit=0.05,
+        limits=Limits(),
+        joint_weights=weights,
+    )
+    previous = np.zeros(joints)
+    for _ in range(60):
+        q = robot.configuration(rng.uniform(-2, 2, joints))
+        goal = robot.frame_pose(q).translation + rng.choice([-0.5, 0.5]) * along
+        command = law(q, goal, previous_rates=previous)
+        assert np.abs(command.joint_rates).max() <= 0.05 * DT * (1 + 1e-9)
+        J_rc = robot.coupling(q).J_rc
+        assert np.linalg.norm(J_rc @ command.joint_rates) <= 64 * EPS * np.linalg.norm(J_rc) * 0.02
+        lost = law.lost_direction(q)
+        scale = 1 / np.sqrt(weights)
+        row = scale * (normal @ J_rc)
+        N = np.eye(joints) - np.outer(row, row) / (row @ row)
+        assert lost.singular_value == pytest.approx(
+            np.linalg.norm(lost.direction @ (scale * robot.coupling(q).J_gt) @ N), abs=1e-12
+        )

@@ -114,6 +114,7 @@ def test_with_three_nodes_the_axis_does_not_drift(ets_vii):
     assert np.ptp(motion.centre_of_mass.values, axis=0).max() < 1e-12
 
 
+@pytest.mark.filterwarnings("ignore:the commanded rates reverse")
 @pytest.mark.parametrize("name", ["case2_flight", "case3_flight"])
 def test_the_plan_holds_at_singularities_too(name):
     """There the iteration on the whole law does not settle, and the last rates are projected instead."""

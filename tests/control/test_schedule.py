@@ -237,6 +237,7 @@ def test_at_the_rate_limits_the_rates_do_not_jump(ets_vii):
     assert changes[1] == pytest.approx(0.5 * changes[0], rel=0.15)
 
 
+@pytest.mark.filterwarnings("ignore:the commanded rates reverse")
 @pytest.mark.parametrize(("nodes", "order", "bound"), [(0, 1, 1e-3), (1, 2, 1e-6), (2, 4, 1e-11)])
 def test_what_is_on_does_not_turn_over_holds(ets_vii, nodes, order, bound):
     """Yaw all the time, hand-overs of the others included; pitch from the end of its hand-over on."""

@@ -182,6 +182,7 @@ def test_a_wheel_s_full_speed_counts_as_much_as_the_arm_s(ets_vii):
     np.testing.assert_array_equal(SelectiveLaw(ets_vii, Protection("all")).joint_weights, np.ones(6))
 
 
+@pytest.mark.filterwarnings("ignore:wheels need more torque")
 def test_small_and_fast_wheels_let_case_1_arrive_under_all_protected(ets_vii):
     """Equal momenta at full speed make the same motion, whatever the inertia."""
     motions = []

@@ -129,3 +129,15 @@ def test_bad_shapes_and_frames(ets_vii):
     ):
         with pytest.raises(ssm.InputError, match=message):
             ets_vii.with_payload(**BOX | {key: value})
+
+
+def test_numbers_that_leave_floating_point_are_refused_by_name():
+    robot = ssm.load_robot("ets_vii")
+    with pytest.raises(ssm.InputError, match="payload inertia"):
+        robot.with_payload(1.0, [0, 0, 0], np.full((3, 3), 1e308))
+    with pytest.raises(ssm.InputError, match="target inertia"):
+        ssm.TumblingTarget(np.eye(3) * 1e308, np.eye(3), [0, 0, 1], [0, 0, 0])
+    with pytest.raises(ssm.InputError, match="target angular_velocity"):
+        ssm.TumblingTarget(np.diag([1.0, 2, 2.5]), np.eye(3), [1e308, 1e308, 1e308], [0, 0, 0])
+    with pytest.raises(ssm.InputError, match="velocity"):
+        robot.momentum(robot.configuration(), np.full(12, 1e308))

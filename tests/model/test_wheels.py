@@ -108,6 +108,7 @@ def test_the_law_shares_out_the_momentum_by_the_smallest_rates(ets_vii, rng, pro
         np.testing.assert_allclose(200.0 * command.joint_rates[spins], -carried, rtol=1e-9, atol=1e-13)
 
 
+@pytest.mark.filterwarnings("ignore:wheels need more torque")
 def test_wheels_let_reactionless_control_arrive(ets_vii):
     """In case 1 it stalls without. All joints weigh the same here: rad/s of a wheel counts as rad/s of the arm."""
     whole = ets_vii.with_wheels(three(spin_inertia=100.0, max_speed=0.6))

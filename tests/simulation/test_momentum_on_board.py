@@ -182,6 +182,7 @@ def start_of(robot: ssm.Robot, pose: pin.SE3 | None = None) -> np.ndarray:
     return robot.configuration({f"joint_{i + 1}": angle for i, angle in enumerate(START)}, pose)
 
 
+@pytest.mark.filterwarnings("ignore:wheels need more torque")
 @pytest.mark.parametrize("turned", [0.0, 0.4])
 def test_wheels_store_what_is_on_board_and_the_base_stands_still(ets_vii, turned):
     robot, pose = wheeled(ets_vii, turned=turned), pin.SE3(pin.rpy.rpyToMatrix(0.5, -0.3, 0.8), np.zeros(3))
@@ -201,6 +202,7 @@ def test_wheels_store_what_is_on_board_and_the_base_stands_still(ets_vii, turned
     assert motion.wheel_momentum.attrs["units"] == "N m s"
 
 
+@pytest.mark.filterwarnings("ignore:wheels need more torque")
 def test_a_wheel_s_momentum_counts_the_base_s_turn(ets_vii):
     robot = wheeled(ets_vii)
     law = SelectiveLaw(robot, Protection("none"), momentum=[0, 0, 0, 0, 0, 40.0])
@@ -213,6 +215,7 @@ def test_a_wheel_s_momentum_counts_the_base_s_turn(ets_vii):
     )
 
 
+@pytest.mark.filterwarnings("ignore:wheels need more torque")
 def test_saturated_wheels_are_told_from_when_to_when(ets_vii, tmp_path):
     """Case 1 under all protected asks 4.6 N m s of the x wheel: one of 2 N m s is at its limit for a while."""
     robot = wheeled(ets_vii, max_speed=20.0)
@@ -247,7 +250,12 @@ def test_more_than_the_wheels_hold(ets_vii):
     weights = [1e-9 if name in robot.wheel_names else 1e9 for name in robot.joint_names]
     options = {"tasks": PostureTask(arm), "joint_weights": weights}
     law = SelectiveLaw(robot, Protection("yaw"), momentum=[0, 0, 0, 0, 0, 100.0], **options)
-    motion = ssm.simulate(law, start_of(robot), START, 2.0, 0.1)
+    with pytest.warns(ssm.DecoupleWarning) as told:
+        motion = ssm.simulate(law, start_of(robot), START, 2.0, 0.1)
+    assert sorted(str(warning.message)[:6] for warning in told) == ["the pr", "wheels"]
+    lost = json.loads(motion.attrs["protection_lost"])
+    assert lost["spans"] == [[0.0, 2.0]]
+    assert lost["largest_rate"] == np.abs(motion.protected_rate).max()
     assert json.loads(motion.attrs["saturated_wheels"])["wheel_z"] == [[0.0, pytest.approx(2.0)]]
     assert np.abs(motion.protected_rate).min() > 1e-3
 

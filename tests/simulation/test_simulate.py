@@ -10,7 +10,8 @@ from random_robots import random_robot, random_state
 
 import ssm_decouple as ssm
 from ssm_decouple import Protection, SelectiveLaw
-from ssm_decouple.simulation.motion import judge, protected_integral
+from ssm_decouple.simulation.motion import judge
+from ssm_decouple.simulation.replay import integral_along
 
 START = np.deg2rad([150, -20, -10, 0, 0, 0])
 TARGET = [-1.8, -0.3, 1.2]
@@ -171,6 +172,7 @@ def test_the_integral_of_the_twist_is_what_it_says(ets_vii, method):
     )
 
 
+@pytest.mark.filterwarnings("ignore:the commanded rates reverse")
 @pytest.mark.parametrize("method", ["explicit", "held", "rk4"])
 def test_modes_of_appendages_are_not_excited(ets_vii, method):
     protection = modes(ets_vii)
@@ -201,7 +203,7 @@ def test_twists_fixed_in_inertial_axes(ets_vii, rng):
     # A mixed direction under another law: the integral of its rate.
     mixed = np.linalg.qr(rng.normal(size=(6, 2)))[0]
     free = ssm.simulate(SelectiveLaw(ets_vii, Protection("none")), q, target, 20.0, 0.05, method="rk4")
-    along = protected_integral(mixed, "inertial", free.base_twist_integral.values, free.configuration.values)
+    along = integral_along(free, mixed, "inertial")
     R = np.array([ets_vii.base_pose(q).rotation for q in free.configuration.values])
     twist = np.hstack(
         [np.einsum("tij,tj->ti", R, free[name].values) for name in ("base_linear_velocity", "base_angular_velocity")]
@@ -405,3 +407,17 @@ def test_a_place_that_cannot_be_written_leaves_nothing_behind(motion, tmp_path):
     with pytest.raises(ssm.FileError, match="cannot write"):
         ssm.save_motion(motion, tmp_path / "motion.nc")
     assert [item.name for item in tmp_path.iterdir()] == ["motion.nc"]
+
+
+def test_what_ends_a_program_carries_the_motion_too():
+    robot = ssm.load_robot("ets_vii")
+    law = ssm.SelectiveLaw(robot, ssm.Protection("yaw"))
+
+    def leaves(time):
+        if time > 0.45:
+            raise SystemExit(3)
+        return [-1.8, -0.3, 1.2], [0.0, 0.0, 0.0]
+
+    with pytest.raises(SystemExit) as left:
+        ssm.simulate(law, robot.configuration(np.deg2rad([150, -20, -10, 0, 0, 0])), leaves, 1.0, 0.1)
+    assert left.value.motion.sizes["time"] == 5

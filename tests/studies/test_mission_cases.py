@@ -122,6 +122,7 @@ def test_a_task_table_of_another_kind_is_refused(write):
         ssm.load_case(write(text.replace("task = 3\n", ""), "odd.toml"))
 
 
+@pytest.mark.filterwarnings("ignore:wheels need more torque")
 def test_full_wheels_are_told(ets_vii):
     """Two wheels of little momentum: one is filled from the start, and slows down when the arm gives momentum back."""
     axes = {"wheel_y": [0, 1, 0], "wheel_z": [0, 0, 1]}

@@ -260,7 +260,9 @@ def test_a_slide_without_limits_is_refused():
     robot = random_robot(0, joints=4)
     index = next(i for i, joint in enumerate(robot.model.joints[2:]) if joint.shortname().startswith("JointModelP"))
     endless = ssm.Robot(robot.urdf, name="endless")
-    endless.position_limits[index] = -np.inf, np.inf
+    limits = endless.position_limits.copy()
+    limits[index] = -np.inf, np.inf
+    endless.__dict__["position_limits"] = limits  # no URDF of such a joint is loaded
     with pytest.raises(ssm.InputError, match=f"joint '{robot.joint_names[index]}' of 'endless' slides without limits"):
         joint_ranges(endless)
 

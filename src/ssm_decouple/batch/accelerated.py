@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from ssm_decouple.batch.base import Engine, Floats, Judge, Progress, Wanted
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.errors import InputError, as_floats, as_kind, as_whole, shown
+from ssm_decouple.model.origin import FAR
+from ssm_decouple.model.robot import UNIT, Robot
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.steps import sample_times
 
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
 
 ON_PROCESSOR, ON_GPU = 128, 65536  # rows that go through each operation together
 CHUNKS = 64  # of them in a block, the unit that travels to the device and back
+MOST_CHUNK = 2**20
 IN_FLIGHT = 2  # blocks: while one is computed the next is prepared
 SAMPLES = 2**26  # of distances to the target in a block: fewer rows where motions are long
 
@@ -59,10 +61,10 @@ class JaxBatch(Engine):
         chunk: int | None = None,
     ) -> None:
         super().__init__(robot, end_effector)
-        if chunk is not None and not (isinstance(chunk, int) and chunk > 0):
-            raise InputError(f"chunk is {chunk!r}; give a positive whole number, or None for one that suits the device")
         self.device = _device(device)
-        self.chunk: int = chunk or (ON_PROCESSOR if self.device.platform == "cpu" else ON_GPU)
+        usual = ON_PROCESSOR if self.device.platform == "cpu" else ON_GPU
+        needs = "give a positive whole number, or None for one that suits the device"
+        self.chunk: int = usual if chunk is None else as_whole("chunk", chunk, 1, needs, MOST_CHUNK)
         self._compiled: dict[tuple[Any, ...], Any] = {}
 
     def __repr__(self) -> str:
@@ -212,8 +214,9 @@ class TracedLaw:
         """Return the momentum matrices (.., rows, n) and the like, base axes, with the names of `Matrices`."""
         from ssm_decouple.batch import functions
 
-        found = functions.matrices(self._arm, _last(joints, "joints"))
-        return functions.Matrices(*(_front(array, array.ndim - joints.ndim + 1) for array in found))
+        columns = _last(joints, "joints", self._law.limits.size)
+        found = functions.matrices(self._arm, columns)
+        return functions.Matrices(*(_front(array, array.ndim - columns.ndim + 1) for array in found))
 
     def command(
         self, joints: Array, target: Array, pose: Array | None = None, gain: Array | float | None = None
@@ -263,6 +266,10 @@ class TracedLaw:
         times = sample_times(duration, dt)
         holds = jax.numpy.asarray(np.diff(times, append=times[-1]))
         law, (columns, place, point) = self._given(joints, target, pose, gain)
+        # Counted from where the base starts, if that is far from the inertial origin.
+        far = jax.numpy.max(jax.numpy.abs(place[:3]), axis=0) > FAR
+        origin = jax.lax.stop_gradient(jax.numpy.where(far, place[:3], 0.0))
+        place, point = place.at[:3].add(-origin), point - origin
 
         def step(state: Any, hold: Array) -> Any:
             columns, place = state
@@ -271,6 +278,7 @@ class TracedLaw:
             return after, (columns, place, told)
 
         _, (all_joints, poses, told) = jax.lax.scan(step, (columns, place), holds)
+        poses = poses.at[:, :3].add(origin)
         told, all_joints, poses = jax.tree.map(lambda x: jax.numpy.moveaxis(x, 0, -1), (told, all_joints, poses))
         return TracedMotion(_front(all_joints, 1), _front(poses, 1), _traced(told))
 
@@ -278,20 +286,41 @@ class TracedLaw:
         self, joints: Array, target: Array, pose: Array | None, gain: Array | float | None
     ) -> tuple[functions.Law, list[Array]]:
         """Return the law, and joints, pose and target with the axes of the batch last, and the same in all."""
+        import jax
         import jax.numpy as jnp
 
         place = jnp.zeros(7).at[6].set(1.0) if pose is None else pose
-        arrays = [_last(array, name) for array, name in ((joints, "joints"), (place, "pose"), (target, "target"))]
+        given = ((joints, "joints", self._law.limits.size), (place, "pose", 7), (target, "target", 3))
+        arrays = [_last(array, name, size) for array, name, size in given]
+        if pose is not None:
+            arrays[1] = _unit(arrays[1])
+        if gain is not None and not isinstance(gain, jax.Array) and not np.all(as_floats("gain", gain) > 0.0):
+            raise InputError(f"gain is {shown(gain)}; it must be a positive number")
         batch = jnp.broadcast_shapes(*(array.shape[1:] for array in arrays))
         spread = [jnp.broadcast_to(_aligned(array, len(batch)), (len(array), *batch)) for array in arrays]
         return self._law if gain is None else self._law._replace(gain=gain), spread
 
 
-def _last(array: Any, name: str) -> Array:
-    """Return an array (.., m) as (m, ..)."""
+def _unit(pose: Array) -> Array:
+    """Return poses (7, ..); refused, or NaN where they are traced, if a quaternion is not of unit length."""
+    import jax
     import jax.numpy as jnp
 
-    given = jnp.asarray(array)
+    lengths = jnp.sqrt(jnp.sum(pose[3:] ** 2, axis=0))
+    off = jnp.abs(lengths - 1.0) > UNIT
+    if not isinstance(off, jax.core.Tracer) and bool(jnp.any(off)):
+        raise InputError("a pose has a quaternion that is not of unit length; divide it by its length")
+    return jnp.where(off, jnp.nan, pose)
+
+
+def _last(array: Any, name: str, size: int) -> Array:
+    """Return an array (.., size) as (size, ..)."""
+    import jax
+    import jax.numpy as jnp
+
+    given = jnp.asarray(array if isinstance(array, jax.Array) else as_floats(name, array))
+    if given.ndim == 0 or given.shape[-1] != size:
+        raise InputError(f"{name} have shape {given.shape}; they need (.., {size})")
     if given.dtype != np.float64:
         raise InputError(
             f"{name} are of type {given.dtype}; the law needs 64 bits: jax.config.update('jax_enable_x64', True), or "
@@ -329,7 +358,8 @@ def _device(device: str | jax.Device | None) -> jax.Device:
     except ImportError:
         raise InputError("JaxBatch needs JAX, which is not installed: pip install 'ssm-decouple[jax]'") from None
     if not isinstance(device, str):
-        return jax.devices()[0] if device is None else device
+        mend = "give 'cpu', 'gpu', a device of JAX's, or None"
+        return jax.devices()[0] if device is None else as_kind("device", device, jax.Device, mend)
     try:
         return jax.devices(device)[0]
     except RuntimeError:
@@ -437,5 +467,6 @@ def _travelled(
         after = joints + hold * told.joint_rates, functions.moved(poses, told.base_twist, hold), record
         return after, jnp.sqrt(jnp.sum(told.end_effector_error**2, axis=0))
 
-    ends, history = jax.lax.scan(step, (joints, poses, functions.start_record(poses)), holds)
-    return (*ends, history)
+    start = joints, poses, functions.start_record(joints, poses)
+    (joints, poses, (record, _)), history = jax.lax.scan(step, start, holds)
+    return joints, poses, record, history

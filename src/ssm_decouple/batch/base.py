@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
@@ -14,9 +14,11 @@ from ssm_decouple.batch.constants import constants_of
 from ssm_decouple.batch.results import Commands, Matrices, Motions
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.control.schedule import ScheduledLaw
-from ssm_decouple.errors import InputError, as_floats, as_positive
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.errors import InputError, as_floats, as_function, as_items, as_kind, as_positive, as_whole, shown
+from ssm_decouple.model.origin import FAR
+from ssm_decouple.model.robot import UNIT, Robot, checked_robot
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.settled import Settled
 from ssm_decouple.simulation.steps import sample_times
 
 Floats = NDArray[np.float64]
@@ -52,12 +54,13 @@ class Wanted:
         )
 
 
-class Engine(ABC):
+class Engine(Settled):
     """What the engines share. A subclass fills arrays that are laid out here, from arguments that are checked here."""
 
     def __init__(self, robot: Robot, end_effector: str | None) -> None:
-        if robot.n_joints == 0:
+        if checked_robot(robot).n_joints == 0:
             raise InputError(f"'{robot.name}' has no joints; put an arm on it with compose(..)")
+        robot.refuse_changed_model()
         self.robot = robot
         self.end_effector = robot.end_effector if end_effector is None else end_effector
         self._constants = constants_of(robot, robot.frame_id(self.end_effector))
@@ -102,6 +105,7 @@ class Engine(ABC):
         Raises:
             InputError: a wrong shape, no numbers, or directions that are not fixed in base axes.
         """
+        as_function("progress", progress)
         given, checked = self._rows("joints", joints), _checked(protections)
         N, P, n = len(given), len(checked), self.robot.n_joints
         found = Matrices(np.empty((N, 12 * n + lanes.SINGLES)), n, np.empty((N, P)), np.empty((N, P)))
@@ -117,6 +121,7 @@ class Engine(ABC):
         It is `Coupling.manipulability(..).smallest`, and `Command.smallest_singular_value` of a law without joint
         weights. 0 where the protection leaves fewer than three freedoms.
         """
+        as_function("progress", progress)
         given, checked = self._rows("joints", joints), _checked(protections)
         wanted = Wanted(smallest=np.empty((len(given), len(checked))))
         self._evaluate(given, checked, wanted, progress)
@@ -131,6 +136,7 @@ class Engine(ABC):
         without bound towards a singularity, and its error with it; a singular value of J_gt N_sub that is rounding,
         as one of a planar arm is, does not count.
         """
+        as_function("progress", progress)
         given, checked = self._rows("joints", joints), _checked(protections)
         wanted = Wanted(factors=np.empty((len(given), len(checked))))
         self._evaluate(given, checked, wanted, progress)
@@ -143,8 +149,7 @@ class Engine(ABC):
 
         The other arguments are those of `matrices`. `joints` may be a memory-mapped array.
         """
-        if size < 1:
-            raise InputError(f"size is {size}; a block needs at least one row")
+        size = as_whole("size", size, 1, "a block needs at least one row")
         given = self._rows("joints", joints)
         for start in range(0, len(given), size):
             place = slice(start, min(start + size, len(given)))
@@ -163,12 +168,13 @@ class Engine(ABC):
             InputError: another law, shapes that do not fit, or a base quaternion that is not of unit length.
         """
         joints, poses, wanted = self._starts(law, configurations, targets)
+        origins = _take_out_origins(poses, wanted)
         out = np.empty((len(joints), law.size))
         self._command(law, joints, poses, wanted, out)
         commands = Commands(out, self.robot.n_joints, law.protection.k)
         tools = commands.end_effector_position.copy()
         rows.place_points(poses, tools)
-        commands.end_effector_position[:], commands.end_effector_error[:] = tools, wanted - tools
+        commands.end_effector_position[:], commands.end_effector_error[:] = tools + origins, wanted - tools
         return commands
 
     def motions(
@@ -195,9 +201,11 @@ class Engine(ABC):
         Raises:
             InputError: another law, shapes that do not fit, or times that make no sense.
         """
+        as_function("progress", progress)
         times = sample_times(duration, dt)
         tolerance = as_positive("arrival_tolerance", arrival_tolerance)
         joints, poses, wanted = self._starts(law, starts, targets)
+        origins = _take_out_origins(poses, wanted)
         N = len(joints)
         record, errors = np.empty((N, rows.RECORD_SIZE)), np.empty(N)
         outcomes: NDArray[np.str_] = np.full(N, "undefined", dtype="<U9")
@@ -205,10 +213,11 @@ class Engine(ABC):
 
         def judge(part: slice, history: Floats) -> None:
             errors[part] = history[:, -1]
-            _judge(times, history, tolerance, 1.0 / law.gain, outcomes[part], outcome_times[part])
+            _judge(times, history, tolerance, 1.0 / law.layout.slowest_gain, outcomes[part], outcome_times[part])
 
         self._move(law, joints, poses, wanted, times, record, judge, progress)
         record[np.isnan(errors)] = np.nan
+        poses[:, :3] += origins
         return Motions(
             outcome=outcomes,
             outcome_time=outcome_times,
@@ -218,13 +227,13 @@ class Engine(ABC):
             protected_rate=record[:, rows.LEAK],
             base_rotation=record[:, rows.HIGHEST : rows.HIGHEST + 3] - record[:, rows.LOWEST : rows.LOWEST + 3],
             smallest_singular_value=record[:, rows.SMALLEST],
+            rate_reversals=record[:, rows.REVERSALS],
             configuration=self._configurations(joints, poses),
         )
 
     def _rows(self, name: str, joints: ArrayLike) -> NDArray[Any]:
-        given = np.asarray(joints)
-        if given.dtype.kind not in "fiu":
-            given = as_floats(name, joints)
+        plain = isinstance(joints, np.ndarray) and joints.dtype.kind in "fiu" and not np.ma.is_masked(joints)
+        given: NDArray[Any] = np.asarray(joints) if plain else as_floats(name, joints)  # may be mapped into memory
         n = self.robot.n_joints
         if given.ndim != 2 or given.shape[1] != n:
             raise InputError(
@@ -266,10 +275,13 @@ class Engine(ABC):
         """Return joint positions (N, n), rad or m, and base poses (N, 7) of configurations (N, nq); copies.
 
         Raises:
-            InputError: a base quaternion that is not of unit length.
+            InputError: another shape, or a base quaternion that is not of unit length.
         """
+        configurations = as_floats("configurations", configurations)
+        if configurations.ndim != 2 or configurations.shape[1] != self.robot.model.nq:
+            raise InputError(f"configurations have shape {configurations.shape}; they need (N, {self.robot.model.nq})")
         poses, joints = configurations[:, :7].copy(), configurations[:, self._places]
-        off = np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1.0) > 1e-6
+        off = np.abs(np.linalg.norm(poses[:, 3:], axis=1) - 1.0) > UNIT
         if off.any():
             row = int(np.argmax(off))
             raise InputError(
@@ -278,7 +290,16 @@ class Engine(ABC):
             )
         for j in np.flatnonzero(self._continuous):
             place = self._places[j]
-            joints[:, j] = np.arctan2(configurations[:, place + 1], configurations[:, place])
+            cosines, sines = configurations[:, place], configurations[:, place + 1]
+            off = np.abs(np.hypot(cosines, sines) - 1.0) > UNIT
+            if off.any():
+                row = int(np.argmax(off))
+                raise InputError(
+                    f"row {row} of configurations: continuous joint '{self.robot.joint_names[j]}' takes cosine and "
+                    f"sine, q[{place}:{place + 2}] is {[float(cosines[row]), float(sines[row])]}; build q with "
+                    "robot.configuration(..)"
+                )
+            joints[:, j] = np.arctan2(sines, cosines)
         return joints, poses
 
     def _configurations(self, joints: Floats, poses: Floats) -> Floats:
@@ -291,8 +312,7 @@ class Engine(ABC):
         return found
 
     def _refuse_other_laws(self, law: SelectiveLaw) -> None:
-        if not isinstance(law, SelectiveLaw):
-            raise InputError(f"law is {law!r}; give a SelectiveLaw")
+        as_kind("law", law, SelectiveLaw, "give a SelectiveLaw")
         if law.robot.urdf != self.robot.urdf or law.robot.end_effector != self.end_effector:
             raise InputError(
                 f"the law moves '{law.robot.end_effector}' of '{law.robot.name}', the engine '{self.end_effector}' of "
@@ -314,13 +334,24 @@ class Engine(ABC):
                 )
 
 
+def _take_out_origins(poses: Floats, targets: Floats) -> Floats:
+    """Count the positions of poses (N, 7) that are far from the inertial origin, and their targets (N, 3), from there.
+
+    In place; what is to be added to come back is returned (N, 3). A position near the origin stays as it is.
+    """
+    far = np.abs(poses[:, :3]).max(axis=1) > FAR
+    origins = np.where(far[:, None] & np.isfinite(poses[:, :3]), poses[:, :3], 0.0)
+    poses[:, :3] -= origins
+    targets -= origins
+    return origins
+
+
 def _checked(protections: Sequence[Protection | str]) -> list[Protection]:
-    if isinstance(protections, (str, Protection)):
-        raise InputError(f"protections is {protections!r}; give a list, such as ['none', 'yaw']")
-    checked = [Protection(given) if isinstance(given, str) else given for given in protections]
+    given = as_items("protections", protections, "give a list, such as ['none', 'yaw']")
+    checked = [Protection(one) if isinstance(one, str) else one for one in given]
     for i, protection in enumerate(checked, 1):
         if not isinstance(protection, Protection):
-            raise InputError(f"protection {i} is {protection!r}; give a Protection, or a name such as 'yaw'")
+            raise InputError(f"protection {i} is {shown(protection)}; give a Protection, or a name such as 'yaw'")
         if protection.frame != "base":
             raise InputError(
                 f"protection {i} is fixed in '{protection.frame}' axes; without base poses only 'base' makes sense"

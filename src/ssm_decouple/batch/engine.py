@@ -15,11 +15,12 @@ from ssm_decouple.batch import lanes, rows
 from ssm_decouple.batch.base import NO_ROWS, Engine, Floats, Judge, Progress, Wanted
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import as_whole
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
 
 CONFIGURATIONS = 8192  # that a thread works on at a time
+MOST_THREADS = 1024
 MOTIONS = 256  # likewise: their matrices stay in the processor's cache
 SAMPLES = 2**22  # of errors that a thread keeps: fewer motions at a time where they are long
 
@@ -46,9 +47,9 @@ class Batch(Engine):
 
     def __init__(self, robot: Robot, end_effector: str | None = None, threads: int | None = None) -> None:
         super().__init__(robot, end_effector)
-        if threads is not None and not (isinstance(threads, int) and threads > 0):
-            raise InputError(f"threads is {threads!r}; give a positive whole number, or None for one a processor")
-        self.threads: int = threads or os.cpu_count() or 1
+        needs = "give a positive whole number, or None for one a processor"
+        count = None if threads is None else as_whole("threads", threads, 1, needs, MOST_THREADS)
+        self.threads: int = count or os.cpu_count() or 1
 
     def __repr__(self) -> str:
         return f"Batch({self.robot!r}, end_effector={self.end_effector!r}, threads={self.threads})"
@@ -108,13 +109,15 @@ class Batch(Engine):
             history = np.empty((times.size, count))
             kept[:] = 0.0
             kept[:, rows.SMALLEST : rows.HIGHEST] = np.inf
-            kept[:, rows.HIGHEST :] = -np.inf
+            kept[:, rows.HIGHEST : rows.LATEST] = -np.inf
+            trail = np.zeros((count, rows.TRAIL_SIZE, self.robot.n_joints))
+            trail[:, rows.BEFORE] = np.nan
             for i, hold in enumerate(holds):
                 if stop.is_set():
                     break
                 rows.see_targets(at, wanted, seen)
                 self._solve(constants, own, seen, values, out)
-                rows.advance(out, protected, k, errors + 3, errors, hold, own, at, kept, history[i])
+                rows.advance(out, protected, k, errors + 3, errors, hold, own, at, kept, trail, history[i])
             judge(part, history.T)
 
         share = -(-len(joints) // self.threads)

@@ -563,31 +563,44 @@ def moved(pose: Array, twist: Array, time: Array) -> Array:
     return jnp.concatenate([pose[:3] + jnp.stack(_rotated(x, c, shift)), size * quaternion])
 
 
-def start_record(pose: Array) -> Array:
-    """Return what is kept of a motion (rows.RECORD_SIZE, ..) before its first sample."""
+def start_record(joints: Array, pose: Array) -> tuple[Array, Array]:
+    """Return what is kept of a motion (rows.RECORD_SIZE, ..) before its first sample, and its trail."""
     empty = np.zeros(rows.RECORD_SIZE)
-    empty[rows.SMALLEST : rows.HIGHEST], empty[rows.HIGHEST :] = np.inf, -np.inf
-    return jnp.broadcast_to(_column(empty, pose.ndim - 1), (rows.RECORD_SIZE, *pose.shape[1:]))
+    empty[rows.SMALLEST : rows.HIGHEST], empty[rows.HIGHEST : rows.LATEST] = np.inf, -np.inf
+    trail = jnp.zeros((rows.TRAIL_SIZE, *joints.shape)).at[rows.BEFORE].set(jnp.nan)
+    return jnp.broadcast_to(_column(empty, pose.ndim - 1), (rows.RECORD_SIZE, *pose.shape[1:])), trail
 
 
-def kept(record: Array, told: Command, pose: Array, time: Array) -> Array:
-    """Return the record brought up to date at a sample, whose command is held for a time, s; as `rows.advance`."""
-    x, y, z, w = pose[3:]
-    attitude = jnp.stack(
+def kept(before: tuple[Array, Array], told: Command, pose: Array, time: Array) -> tuple[Array, Array]:
+    """Return record and trail brought up to date at a sample, whose command is held for a time, s.
+
+    As `rows.advance`.
+    """
+    (record, trail), (x, y, z, w) = before, pose[3:]
+    within = jnp.stack(
         [
             jnp.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y)),
             jnp.arcsin(jnp.clip(2.0 * (w * y - z * x), -1.0, 1.0)),
             jnp.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z)),
         ]
     )
+    attitude = within + 2.0 * np.pi * jnp.rint((record[rows.LATEST : rows.REVERSALS] - within) / (2.0 * np.pi))
     rates, leaks = told.joint_rates, jnp.abs(told.protected_rate)
-    return jnp.concatenate(
+    peak = jnp.maximum(record[rows.PEAK], jnp.max(jnp.abs(rates), axis=0))
+    change, own = rates - trail[rows.BEFORE], jnp.maximum(trail[rows.OWN_PEAK], jnp.abs(rates))
+    large = jnp.abs(change) > jnp.maximum(rows.REVERSAL_SHARE * own, rows.NOTHING * peak)
+    turn = jnp.where(large & (change * trail[rows.CHANGE] < 0.0), 1.0, 0.0)
+    count = trail[rows.COUNT] + turn * trail[rows.TURN]
+    record = jnp.concatenate(
         [
             (record[rows.TRAVEL] + time * jnp.sqrt(_square(rates)))[None],
-            jnp.maximum(record[rows.PEAK], jnp.max(jnp.abs(rates), axis=0))[None],
+            peak[None],
             jnp.maximum(record[rows.LEAK], jnp.max(leaks, axis=0, initial=0.0))[None],
             jnp.minimum(record[rows.SMALLEST], told.smallest_singular_value)[None],
             jnp.minimum(record[rows.LOWEST : rows.HIGHEST], attitude),
-            jnp.maximum(record[rows.HIGHEST :], attitude),
+            jnp.maximum(record[rows.HIGHEST : rows.LATEST], attitude),
+            attitude,
+            jnp.max(count, axis=0)[None],
         ]
     )
+    return record, jnp.stack([rates, jnp.where(large, change, 0.0), turn, own, count])

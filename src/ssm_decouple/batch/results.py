@@ -118,10 +118,13 @@ class Motions:
         final_error: Distance to the target at the end (N,), m.
         joint_travel: Norm of the joint rates integrated over time (N,), rad (and m, of sliding joints).
         peak_rate: Largest rate of any joint (N,), rad/s or m/s.
-        protected_rate: Largest rate along a protected direction of the law, abs(J_sub q_dot) (N,), rad/s (m/s of
-            directions that shift): rounding.
-        base_rotation: Base roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), peak to peak (N, 3), rad.
+        protected_rate: Largest rate along a protected direction of the law at a sample, abs(J_sub q_dot) (N,), rad/s
+            (m/s of directions that shift): rounding.
+        base_rotation: Base roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), peak to peak (N, 3), rad; each is
+            counted on beyond half a turn.
         smallest_singular_value: Of J_gt N_sub, the smallest on the way (N,), m.
+        rate_reversals: How often the rate of a joint reverses from sample to sample, of the joint that does it most
+            (N,): hundreds where the command chatters at a singularity.
         configuration: Pinocchio configuration at the end (N, nq).
     """
 
@@ -133,4 +136,5 @@ class Motions:
     protected_rate: Floats
     base_rotation: Floats
     smallest_singular_value: Floats
+    rate_reversals: Floats
     configuration: Floats

@@ -23,7 +23,20 @@ LEAK = 2  # largest rate along a protected direction
 SMALLEST = 3  # smallest singular value
 LOWEST = 4  # 3: roll, pitch and yaw at their lowest
 HIGHEST = 7  # 3: at their highest
-RECORD_SIZE = 10
+LATEST = 10  # 3: as they are now, counted on beyond half a turn
+REVERSALS = 13  # of the joint rate that reverses most often from sample to sample
+RECORD_SIZE = 14
+
+# What has to be known of the samples before to see that, one entry a joint.
+BEFORE = 0  # the rate at the sample before; not a number at the first
+CHANGE = 1  # its change, if that was large, else zero
+TURN = 2  # 1.0 if that was against a large change before it
+OWN_PEAK = 3  # largest rate of the joint so far
+COUNT = 4  # reversals so far
+TRAIL_SIZE = 5
+
+REVERSAL_SHARE = 0.05  # as in simulation/telling.py
+NOTHING = 1e-6  # likewise
 
 
 @compiled
@@ -73,14 +86,34 @@ def move_pose(pose: Floats, twist: Floats, time: float) -> None:
 
 @compiled
 def keep_attitude(pose: Floats, record: Floats) -> None:
-    """Widen the ranges of roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), to hold those of a pose."""
+    """Widen the ranges of roll, pitch and yaw, R = Rz(yaw) Ry(pitch) Rx(roll), to hold those of a pose.
+
+    Each goes on from where it was before, so that half a turn is no jump.
+    """
     x, y, z, w = pose[3], pose[4], pose[5], pose[6]
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = np.arcsin(min(max(2.0 * (w * y - z * x), -1.0), 1.0))
     yaw = np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    for i, angle in enumerate((roll, pitch, yaw)):
+    for i, within in enumerate((roll, pitch, yaw)):
+        angle = within + 2.0 * np.pi * np.rint((record[LATEST + i] - within) / (2.0 * np.pi))
+        record[LATEST + i] = angle
         record[LOWEST + i] = min(record[LOWEST + i], angle)
         record[HIGHEST + i] = max(record[HIGHEST + i], angle)
+
+
+@compiled
+def keep_reversals(rates: Floats, trail: Floats, record: Floats) -> None:
+    """Count the joint rates (n,) that reverse: whose last three changes are large and alternate in sign."""
+    for j in range(rates.shape[0]):
+        change = rates[j] - trail[BEFORE, j]
+        trail[OWN_PEAK, j] = max(trail[OWN_PEAK, j], abs(rates[j]))
+        large = abs(change) > max(REVERSAL_SHARE * trail[OWN_PEAK, j], NOTHING * record[PEAK])
+        turn = 1.0 if large and change * trail[CHANGE, j] < 0.0 else 0.0
+        trail[COUNT, j] += turn * trail[TURN, j]
+        trail[TURN, j] = turn
+        trail[CHANGE, j] = change if large else 0.0
+        trail[BEFORE, j] = rates[j]
+        record[REVERSALS] = max(record[REVERSALS], trail[COUNT, j])
 
 
 @unlocked
@@ -119,6 +152,7 @@ def advance(
     joints: Floats,
     poses: Floats,
     record: Floats,
+    trail: Floats,
     history: Floats,
 ) -> None:
     """Keep what a sample tells of each motion, then hold its rates and its base twist for a time.
@@ -133,6 +167,7 @@ def advance(
         joints: Joint positions (rows, n), moved.
         poses: Base poses (rows, 7), moved.
         record: (rows, RECORD_SIZE), brought up to date.
+        trail: (rows, TRAIL_SIZE, n), likewise.
         history: The distance to the target at this sample (rows,), overwritten.
     """
     n = joints.shape[1]
@@ -151,6 +186,7 @@ def advance(
             kept[LEAK] = max(kept[LEAK], abs(command[protected + i]))
         kept[TRAVEL] += time * np.sqrt(square)
         kept[SMALLEST] = min(kept[SMALLEST], command[smallest])
+        keep_reversals(command[6 : 6 + n], trail[row], kept)
         keep_attitude(poses[row], kept)
         if time > 0.0:
             move_pose(poses[row], command, time)

@@ -17,12 +17,22 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ssm_decouple.cli.shared import INTERRUPTED, AsJson, NoProgress, Output, complain, escape_markup, print_table
-from ssm_decouple.errors import DecoupleError, InputError
+from ssm_decouple.cli.shared import (
+    INTERRUPTED,
+    AsJson,
+    Force,
+    NoProgress,
+    Output,
+    complain,
+    escape_markup,
+    keep_motion,
+    print_table,
+)
+from ssm_decouple.errors import DecoupleError, FileError, InputError
 
 if TYPE_CHECKING:
     from ssm_decouple.studies.campaign import Campaign
-    from ssm_decouple.studies.store import Tally
+    from ssm_decouple.studies.store import Store, Tally
 
 campaign = typer.Typer(
     no_args_is_help=True,
@@ -99,6 +109,32 @@ def status(store: StorePath, as_json: AsJson = False) -> None:
     typer.echo(f"cases {', '.join(found.cases)}; protections {', '.join(found.protections)}")
     typer.echo(f"computed by {', '.join(f'{name} {version}' for name, version in found.versions.items())}")
     typer.echo(f"campaign {found.sha256}")
+    for fault in found.damaged:
+        typer.echo(f"damaged: {fault}")
+    if found.damaged:
+        typer.echo(_mend(store))
+
+
+@campaign.command()
+def verify(store: StorePath, as_json: AsJson = False) -> None:
+    """Read all that a store holds and say what of it is damaged or lost. Exit status 1 if anything is.
+
+    'campaign run' with --resume mends it: it computes again what is not as it was written.
+    """
+    from ssm_decouple.studies.store import Store
+
+    found = Store.open(store)
+    faults, there = found.damage(), found.rows_there()
+    if as_json:
+        told = {"checksums": found.checked, "samples": len(there), "there": int(there.sum()), "damaged": faults}
+        typer.echo(json.dumps(told, indent=2))
+    else:
+        for fault in faults:
+            typer.echo(f"damaged: {fault}")
+        how = "as they were written" if found.checked else "readable; without checksums no more can be said"
+        typer.echo(_mend(store) if faults else f"{there.sum()} of {len(there)} samples are there, all {how}")
+    if faults:
+        raise typer.Exit(1)
 
 
 @campaign.command()
@@ -109,10 +145,14 @@ def summary(
 ) -> None:
     """Print what came of it, by case and protection: who arrived, how fast, how far the base turned."""
     from ssm_decouple.studies.comparison import write_csv
-    from ssm_decouple.studies.store import Store
     from ssm_decouple.viewing.table import plain
 
-    tallies = Store.open(store).tallies()
+    kept = _whole(store)
+    tallies, there = kept.tallies(), kept.rows_there()
+    if not there.all():
+        complain(f"{len(there) - there.sum()} of {len(there)} samples are not there; --resume goes on with them")
+    if csv is not None and csv.suffix.lower() != ".csv":
+        raise InputError(f"--csv is '{csv}'; its name must end in .csv")
     if csv is not None and tallies:
         write_csv(tallies, csv)
     if as_json:
@@ -130,11 +170,10 @@ def plot(store: StorePath, output: Output = Path("results")) -> None:
 
     Samples that are not there yet are left out, so that a campaign can be looked at while it runs.
     """
-    from ssm_decouple.studies.store import Store
     from ssm_decouple.viewing.campaign import campaign_sheet
     from ssm_decouple.viewing.style import save
 
-    for path in save(campaign_sheet(Store.open(store)), output, store.resolve().stem):
+    for path in save(campaign_sheet(_whole(store)), output, store.resolve().stem):
         typer.echo(path)
 
 
@@ -143,6 +182,7 @@ def rerun(
     store: StorePath,
     sample: Annotated[int, typer.Argument(help="Number of the sample, from 0.")],
     output: Output = Path("results"),
+    force: Force = False,
     as_json: AsJson = False,
 ) -> None:
     """Compute one sample alone, from what the store holds, write its whole motion and compare.
@@ -156,10 +196,13 @@ def rerun(
     kept = Store.open(store)
     found = kept.campaign
     case, protection, draw = found.place(sample)
-    stored = kept.row(sample)
+    fault = kept.fault_of(sample)
+    if fault is not None:
+        complain(f"[bold yellow]warning:[/] the chunk is not as it was written: {escape_markup(fault)}")
+    stored = kept.row(sample, though_damaged=fault is not None)
     again = {name: values[0] for name, values in found.rows([sample]).items()}
     same = all(_same(stored[name], again[name]) for name in stored)
-    computed, path = _motion_of(found, sample, output)
+    computed, path = _motion_of(found, sample, output, force)
     told = _compared(stored, computed)
     if as_json:
         rows = {name: {"stored": _plain(old), "computed": _plain(new)} for name, old, new in told}
@@ -174,6 +217,29 @@ def rerun(
         typer.echo(f"the store was computed by {kept.versions}, this is {versions()}")
     if path is not None:
         typer.echo(f"the motion is in {path}")
+
+
+def _mend(store: Path) -> str:
+    return f"'ssm-decouple campaign run FILE --output {store} --resume' computes it again"
+
+
+def _whole(path: Path) -> Store:
+    """Return a store of which nothing is damaged: what is not is no matter for statistics.
+
+    Raises:
+        FileError: something is.
+    """
+    from ssm_decouple.studies.store import Store
+
+    found = Store.open(path)
+    faults = found.damage()
+    if faults:
+        more = f", and {len(faults) - 1} more" if faults[1:] else ""
+        raise FileError(
+            f"'{path}' is damaged: {faults[0]}{more}. 'ssm-decouple campaign verify {path}' lists all that is, and "
+            f"{_mend(path)}"
+        )
+    return found
 
 
 def tally_table(tallies: Sequence[Tally]) -> list[list[str]]:
@@ -208,17 +274,16 @@ def tally_table(tallies: Sequence[Tally]) -> list[list[str]]:
     return lines
 
 
-def _motion_of(found: Campaign, sample: int, output: Path) -> tuple[dict[str, Any], Path | None]:
+def _motion_of(found: Campaign, sample: int, output: Path, force: bool) -> tuple[dict[str, Any], Path | None]:
     """Return what a store would keep of a sample's motion, and where the motion is written."""
     from ssm_decouple.files import writable_folder
-    from ssm_decouple.simulation.motion import save_motion
     from ssm_decouple.studies.campaign import FAILED, results_of
 
     try:
         motion = found.motion(sample)
     except DecoupleError as error:
         return {"outcome": FAILED, "error": " ".join(str(error).split())}, None
-    return results_of(motion), save_motion(motion, writable_folder(output) / f"sample_{sample}.nc")
+    return results_of(motion), keep_motion(motion, writable_folder(output) / f"sample_{sample}.nc", force)
 
 
 def _compared(stored: Mapping[str, Any], computed: Mapping[str, Any]) -> list[tuple[str, Any, Any]]:

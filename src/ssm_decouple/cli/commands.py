@@ -21,6 +21,7 @@ from ssm_decouple.cli.shared import (
     NOT_ARRIVED,
     AsJson,
     Cases,
+    Force,
     NoFigures,
     NoProgress,
     Output,
@@ -31,6 +32,7 @@ from ssm_decouple.cli.shared import (
     load,
     print_table,
     progress_bar,
+    telling_what_is_replaced,
 )
 from ssm_decouple.cli.study import Study, study
 from ssm_decouple.cli.view import add_viewer
@@ -79,7 +81,8 @@ def main() -> None:
     """Run the command; an expected error is one line on standard error and exit status 1."""
     warnings.showwarning = _show_warning
     try:
-        app()
+        with telling_what_is_replaced():
+            app()
     except DecoupleError as error:
         complain(f"[bold red]error:[/] {escape_markup(error)}")
         sys.exit(1)
@@ -100,13 +103,15 @@ def run(
     protect: Protect = None,
     damping: Damping = None,
     dynamic: Dynamics = False,
+    force: Force = False,
     no_figures: NoFigures = False,
     no_progress: NoProgress = False,
     as_json: AsJson = False,
 ) -> None:
     """Simulate cases under their own protection and write motions and figures.
 
-    Writes OUTPUT/CASE/LAW.nc and the figures beside it. Exit status 3 if one does not reach its target.
+    Writes OUTPUT/CASE/LAW.nc and the figures beside it. Exit status 3 if one does not reach its target. A file with a
+    motion of another law, method or time between samples is not replaced without --force.
 
     Examples: ssm-decouple run case1; ssm-decouple run my.toml --protect yaw --output somewhere
     """
@@ -117,11 +122,12 @@ def run(
     if protect is not None:
         law = {"none": "none", "all": "reactionless"}.get(protect, f"protect {protect}")
         chosen = Protection.parse(protect)
-    work = _Work(output, no_figures, as_json)
+    work = _Work(output, no_figures, as_json, force)
     with work.collecting(), progress_bar(no_progress or as_json) as show:
         for case in load(cases, damping, dynamic):
             if protect is not None:  # it becomes the case's own, so that w_sub is about these axes
                 case = dataclasses.replace(case, protection=chosen)
+            work.refuse_another(case, law, dt)
             motion = case.run(dt=dt, progress=partial(show, case.name, law))
             work.keep_motion(case, law, motion)
             work.draw(case, law, motion)
@@ -140,6 +146,7 @@ def compare(
     dynamic: Dynamics = False,
     targets: NumberOfTargets = None,
     seed: TargetSeed = 0,
+    force: Force = False,
     no_figures: NoFigures = False,
     no_progress: NoProgress = False,
     as_json: AsJson = False,
@@ -162,7 +169,7 @@ def compare(
         loaded = load(cases, damping, dynamic)
         _compare_at_targets(Study("targets", output, no_figures, as_json), loaded, targets, seed, dt, no_progress)
         return
-    work = _Work(output, no_figures, as_json)
+    work = _Work(output, no_figures, as_json, force)
     with work.collecting(), progress_bar(no_progress or as_json) as show:
         for case in load(cases, damping, dynamic):
             motions = {}
@@ -222,10 +229,10 @@ def plot(
 
 @app.command()
 def check(
-    robot: Annotated[str, typer.Argument(help="A URDF or TOML file, or the name of a robot of the catalogue.")],
+    robot: Annotated[str, typer.Argument(help="A URDF, MJCF or TOML file, or the name of a robot of the catalogue.")],
     as_json: AsJson = False,
 ) -> None:
-    """Say what a robot is made of and what is suspicious or impossible in its URDF.
+    """Say what a robot is made of and what is suspicious or impossible in its file.
 
     Exit status 1 if it cannot be used.
     """
@@ -314,14 +321,14 @@ class _Work(Products):
 
     def report(self) -> None:
         """Print the rows, the reasons and where the files are; leave with the interrupted status if it was."""
-        from ssm_decouple.viewing.table import explain, saturation, terminal_table
+        from ssm_decouple.viewing.table import explain, not_kept, saturation, terminal_table
 
         if self.as_json:
             self.print_json()
         elif self.rows:
             print_table(terminal_table(self.rows))
             for row in self.rows:
-                for remark in filter(None, (explain(row), saturation(row))):
+                for remark in filter(None, (explain(row), saturation(row), not_kept(row))):
                     typer.echo(remark)
             typer.echo(f"\n{len(self.files)} files in {self.folder}")
         if self.interrupted:

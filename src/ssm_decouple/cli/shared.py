@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import re
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -14,7 +16,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import DecoupleWarning, FileError, InputError
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -31,6 +33,7 @@ Cases = Annotated[list[str], typer.Argument(help=_CASES, show_default=False)]
 Output = Annotated[Path, typer.Option("--output", "-o", help="Folder for what is written.")]
 NoFigures = Annotated[bool, typer.Option("--no-figures", help="Write no figures.")]
 NoProgress = Annotated[bool, typer.Option("--no-progress", help="Show no progress.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace files that hold motions of another law, method or --dt.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON to standard output instead of tables.")]
 
 
@@ -58,25 +61,48 @@ def load(names: list[str], damping: float | None = None, dynamic: bool = False) 
 
 
 class Products:
-    """What a command has produced so far: rows of results and files."""
+    """What a command has produced so far: rows of results and files.
 
-    def __init__(self, folder: Path, no_figures: bool, as_json: bool) -> None:
+    A file that holds a motion of other settings is not replaced, unless it shall be.
+    """
+
+    def __init__(self, folder: Path, no_figures: bool, as_json: bool, force: bool = False) -> None:
         from ssm_decouple.files import writable_folder
 
         self.folder = writable_folder(folder)
         self.no_figures = no_figures
         self.as_json = as_json
+        self.force = force
         self.rows: list[Any] = []
         self.files: list[Path] = []
         self.interrupted = False
 
     def keep_motion(self, case: Case, name: str, motion: xr.Dataset) -> None:
-        """Write a motion into its case's folder."""
-        from ssm_decouple.files import writable_folder
-        from ssm_decouple.simulation.motion import save_motion
+        """Write a motion into its case's folder.
 
-        place = writable_folder(self.folder / case.name)
-        self.files.append(save_motion(motion, place / f"{file_name(name)}.nc"))
+        Raises:
+            FileError: it cannot be written, or a motion of other settings is there.
+        """
+        from ssm_decouple.files import writable_folder
+
+        writable_folder(self.folder / case.name)
+        self.files.append(keep_motion(motion, self._place(case, name), self.force))
+
+    def refuse_another(self, case: Case, name: str, dt: float | None) -> None:
+        """Refuse, before a motion is computed, a place that holds one of other settings.
+
+        Raises:
+            FileError: it does.
+        """
+        with suppress(InputError):  # of what cannot be run the run tells
+            method = case.simulation.get("method", "explicit")
+            law = json.loads(json.dumps(case.make_law(dt=dt).describe()))
+            planned = {"dt": case.dt if dt is None else dt, **_flat("law", law)}
+            planned["method"] = method if isinstance(method, str) else "dynamic"
+            _refuse_another(self._place(case, name), planned, self.force)
+
+    def _place(self, case: Case, name: str) -> Path:
+        return self.folder / case.name / f"{file_name(name)}.nc"
 
     def draw_sheet(self, name: str, figure: Callable[[Any], Figure], subject: Any) -> None:
         """Draw one figure, its name being a path under the folder, unless none are wanted."""
@@ -91,6 +117,70 @@ class Products:
         rows = [dataclasses.asdict(row) for row in self.rows]
         found = {"interrupted": self.interrupted, "rows": rows, "files": [str(path) for path in self.files]}
         typer.echo(json.dumps(found, indent=2))
+
+
+def keep_motion(motion: xr.Dataset, path: Path, force: bool) -> Path:
+    """Write a motion, unless one of another law, method or time between samples is there.
+
+    Raises:
+        FileError: it is, or the place cannot be written.
+    """
+    from ssm_decouple.simulation.motion import save_motion
+
+    _refuse_another(path, _settings(motion), force)
+    return save_motion(motion, path)
+
+
+def _refuse_another(path: Path, planned: Mapping[str, Any], force: bool) -> None:
+    from ssm_decouple.simulation.motion import load_motion
+
+    if force or not path.is_file():
+        return
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", DecoupleWarning)  # that an older file has no checksum
+            there = _settings(load_motion(path))
+    except FileError as error:
+        raise FileError(f"{error}; --force replaces it, or choose another --output") from None
+    told = [
+        f"{key} is {there.get(key)} there, {value} here" for key, value in planned.items() if there.get(key) != value
+    ]
+    if told:
+        listed = "; ".join(told[:3]) + (f"; and {len(told) - 3} more" if told[3:] else "")
+        raise FileError(f"'{path}' holds another motion: {listed}. --force replaces it, or choose another --output")
+
+
+def _settings(motion: xr.Dataset) -> dict[str, Any]:
+    """Return under which settings a motion came about."""
+    time = motion.time.values
+    found = {"dt": float(f"{time[1] - time[0]:.9g}") if len(time) > 1 else None, "method": motion.attrs.get("method")}
+    for name in ("law", "physics"):
+        found |= _flat(name, json.loads(motion.attrs.get(name, "{}")))
+    return found
+
+
+def _flat(name: str, settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {f"{name}.{key}": value for key, value in settings.items()}
+
+
+@contextmanager
+def telling_what_is_replaced() -> Iterator[None]:
+    """Say at the end in one line which files held something else before."""
+    from ssm_decouple.files import LOG
+
+    told: list[str] = []
+    handler, level = logging.Handler(), LOG.level
+    handler.emit = lambda record: told.append(record.getMessage())  # type: ignore[method-assign]
+    LOG.addHandler(handler)
+    LOG.setLevel(logging.INFO)
+    try:
+        yield
+    finally:
+        LOG.removeHandler(handler)
+        LOG.setLevel(level)
+        if told:
+            more = f" and {len(told) - 3} more files" if told[3:] else ""
+            complain(f"replaced {escape_markup(', '.join(told[:3]))}{more}, which held something else")
 
 
 def print_table(table: Table) -> None:

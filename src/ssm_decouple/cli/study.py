@@ -14,6 +14,7 @@ from ssm_decouple.cli.shared import (
     INTERRUPTED,
     AsJson,
     Cases,
+    Force,
     NoFigures,
     NoProgress,
     Output,
@@ -74,6 +75,7 @@ def study_bending(
     torque: Annotated[
         bool, typer.Option("--torque", help="Drive the joints by torques; without, they follow each command at once.")
     ] = False,
+    force: Force = False,
     no_figures: NoFigures = False,
     no_progress: NoProgress = False,
     as_json: AsJson = False,
@@ -91,7 +93,7 @@ def study_bending(
     from ssm_decouple.viewing.table import bending_table
 
     bendable = [flexible(case) for case in load(cases)]
-    work = Study("bending", output, no_figures, as_json)
+    work = Study("bending", output, no_figures, as_json, force)
     with work.collecting(), progress_bar(no_progress or as_json) as show:
         for case in bendable:
             motions = {}
@@ -110,6 +112,7 @@ def study_pointing(
     output: Output = Path("results"),
     boresight: Annotated[str, typer.Option(help="Where the instrument looks, base axes, 'x,y,z'.")] = "0,1,0",
     step: Annotated[float, typer.Option(help="Physics step, s.")] = 1e-3,
+    force: Force = False,
     no_figures: NoFigures = False,
     no_progress: NoProgress = False,
     as_json: AsJson = False,
@@ -126,7 +129,7 @@ def study_pointing(
     from ssm_decouple.viewing.table import pointing_table
 
     line = _numbers("boresight", boresight)
-    work = Study("pointing", output, no_figures, as_json)
+    work = Study("pointing", output, no_figures, as_json, force)
     with work.collecting(), progress_bar(no_progress or as_json) as show:
         for case in load(cases):
             motions = {}
@@ -191,8 +194,8 @@ def study_robustness(
 class Study(Products):
     """Rows of a study, with its motions, so that an interruption or an error keeps them."""
 
-    def __init__(self, name: str, folder: Path, no_figures: bool, as_json: bool) -> None:
-        super().__init__(folder, no_figures, as_json)
+    def __init__(self, name: str, folder: Path, no_figures: bool, as_json: bool, force: bool = False) -> None:
+        super().__init__(folder, no_figures, as_json, force)
         self.name = name
         self.error: DecoupleError | None = None
 

@@ -107,6 +107,9 @@ def render(
     """
     if html is None and png is None and mp4 is None:
         raise InputError("say what to write: --html, --png or --mp4, each with a file")
+    for option, place, endings in (("html", html, ".html .htm"), ("png", png, ".png"), ("mp4", mp4, ".mp4 .gif")):
+        if place is not None and place.suffix.lower() not in endings.split():
+            raise InputError(f"--{option} is '{place}'; its name must end in {endings.replace(' ', ' or ')}")
     pixels = _pixels(size)
     from ssm_decouple.viewing.viewer.server import require_viser
 

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 Robots = Annotated[
     list[str] | None,
-    typer.Argument(help="Names of the catalogue, URDFs or TOML files; without any, ets_vii.", show_default=False),
+    typer.Argument(help="Names of the catalogue, URDF, MJCF or TOML files; without any, ets_vii.", show_default=False),
 ]
 
 

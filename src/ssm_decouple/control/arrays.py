@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.errors import InputError, as_floats
+from ssm_decouple.errors import InputError, as_floats, as_number
 
 Floats = NDArray[np.float64]
 
@@ -35,6 +35,8 @@ def base_twist_map(A_g: ArrayLike, out: Floats | None = None) -> Floats:
         InputError: a wrong shape, or an inertia of the whole that is singular or not finite.
     """
     given = np.asfortranarray(as_floats("A_g", A_g))
+    if not np.all(np.isfinite(given)):
+        raise InputError("A_g is not finite")
     if given.ndim != 2 or given.shape[0] != 6 or given.shape[1] < 7:
         raise InputError(f"A_g has shape {given.shape}; it needs (6, 6 + n) with n joints, one or more")
     J_base = _output(out, (6, given.shape[1] - 6))
@@ -93,14 +95,17 @@ def selective_rates(
             f"rate_limits are {limits.tolist()} and joint_weights {weights.tolist()}; all must be above zero, the "
             "weights finite"
         )
-    if not (damping >= 0.0 and damping_threshold > 0.0 and np.isfinite(damping) and np.isfinite(damping_threshold)):
+    damping, damping_threshold = as_number("damping", damping), as_number("damping_threshold", damping_threshold)
+    if not (damping >= 0.0 and damping_threshold > 0.0):
         raise InputError(
-            f"damping is {damping} and damping_threshold {damping_threshold}; they must be finite, the first zero or "
-            "more and the second above zero"
+            f"damping is {damping} and damping_threshold {damping_threshold}; the first must be zero or more and the "
+            "second above zero"
         )
     rates = _output(out, (n,))
     scale = 1.0 / np.sqrt(weights)
-    if kernel.rates_of(rows, task, velocity, wanted, limits, scale, damping, damping_threshold, rates) != kernel.OK:
+    finite = np.isfinite(rows).all() and np.isfinite(wanted).all()  # rows that are not would protect nothing
+    arguments = (rows, task, velocity, wanted, limits, scale, damping, damping_threshold, rates)
+    if not finite or kernel.rates_of(*arguments) != kernel.OK:
         raise InputError("J_sub, J_task, task_velocity or protected_rate is not finite")
     return rates
 
@@ -109,6 +114,8 @@ def _matrix(name: str, values: ArrayLike) -> Floats:
     matrix = np.ascontiguousarray(as_floats(name, values))
     if matrix.ndim != 2:
         raise InputError(f"{name} has shape {matrix.shape}; it needs two dimensions, rows and joints")
+    if not np.all(np.isfinite(matrix)):
+        raise InputError(f"{name} is not finite")
     return matrix
 
 
@@ -127,7 +134,7 @@ def _spread(name: str, values: ArrayLike, size: int) -> Floats:
 def _output(out: Floats | None, shape: tuple[int, ...]) -> Floats:
     if out is None:
         return np.empty(shape)
-    fit = isinstance(out, np.ndarray) and out.dtype == np.float64 and out.shape == shape
-    if not (fit and out.flags.c_contiguous and out.flags.writeable):
+    fit = type(out) is np.ndarray and out.dtype == np.float64 and out.shape == shape
+    if not (fit and out.flags.carray):
         raise InputError(f"out must be a writable, contiguous float64 array {shape}")
     return out

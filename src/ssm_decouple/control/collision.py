@@ -12,8 +12,12 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import NDArray
 
-from ssm_decouple.errors import InputError, ModelError, as_not_negative, as_positive
+from ssm_decouple.errors import InputError, ModelError, as_items, as_not_negative, as_positive, shown
+from ssm_decouple.model.folded import flat_collisions, has_many_fixed_links
+from ssm_decouple.model.origin import from_base
+from ssm_decouple.model.plain import parser_heard, pinocchio_text
 from ssm_decouple.model.robot import Robot
+from ssm_decouple.model.urdf import parse_urdf
 
 Floats = NDArray[np.float64]
 Pair = tuple[str, str]
@@ -49,12 +53,22 @@ class Clearance:
     ignored: Sequence[Pair] = ()
 
     def __post_init__(self) -> None:
-        as_not_negative("distance", self.distance)
-        if self.horizon is not None and not as_positive("horizon", self.horizon) > self.distance:
-            raise InputError(f"horizon is {self.horizon} m; it must be beyond the distance {self.distance} m")
-        for pair in (*(self.pairs or ()), *self.ignored):
-            if isinstance(pair, str) or len(pair) != 2 or not all(isinstance(name, str) for name in pair):
-                raise InputError(f"{pair!r} is no pair of link names, such as ('bus', 'link_3')")
+        object.__setattr__(self, "distance", as_not_negative("distance", self.distance))
+        if self.horizon is not None:
+            object.__setattr__(self, "horizon", as_positive("horizon", self.horizon))
+            if not self.horizon > self.distance:
+                raise InputError(f"horizon is {self.horizon} m; it must be beyond the distance {self.distance} m")
+        object.__setattr__(self, "pairs", None if self.pairs is None else _pairs("pairs", self.pairs))
+        object.__setattr__(self, "ignored", _pairs("ignored", self.ignored))
+
+
+def _pairs(name: str, given: Sequence[Pair]) -> tuple[Pair, ...]:
+    pairs = as_items(name, given, "it is a list of pairs of link names, such as [('bus', 'link_3')]")
+    for pair in pairs:
+        two = isinstance(pair, list | tuple) and len(pair) == 2
+        if not two or not all(isinstance(link, str) for link in pair):
+            raise InputError(f"{shown(pair)} is no pair of link names, such as ('bus', 'link_3')")
+    return tuple((first, second) for first, second in pairs)
 
 
 class Distances:
@@ -99,7 +113,7 @@ class Distances:
         for first, second in chosen:
             self._geometry.addCollisionPair(pin.CollisionPair(first, second))
         self.names: tuple[Pair, ...] = tuple((links[first], links[second]) for first, second in chosen)
-        self._data = robot.model.createData()
+        self._data = pin.Data(robot.model)
         self._results = self._geometry.createData()
         self._candidates = _Candidates.of(self._geometry)
         self._request, self._result = coal.DistanceRequest(), coal.DistanceResult()
@@ -135,7 +149,7 @@ class Distances:
         Args:
             q: Configuration (nq,).
         """
-        model, geometry, results = self.robot.model, self._geometry, self._results
+        model, geometry, results, q = self.robot.model, self._geometry, self._results, from_base(q)
         J = pin.computeJointJacobians(model, self._data, q)[:, 6:]
         pin.updateGeometryPlacements(model, self._data, geometry, results)
         pin.computeDistances(geometry, results)
@@ -191,7 +205,8 @@ class Distances:
         Raises:
             InputError: the message names them and says how deep.
         """
-        pin.updateGeometryPlacements(self.robot.model, self._data, self._geometry, self._results, self.robot.checked(q))
+        near = from_base(self.robot.checked(q))
+        pin.updateGeometryPlacements(self.robot.model, self._data, self._geometry, self._results, near)
         pin.computeDistances(self._geometry, self._results)
         for pair, result in zip(self.names, self._results.distanceResults, strict=True):
             if result.min_distance < 0.0:
@@ -275,10 +290,14 @@ def _rates(J: Floats, normals: Floats, points: Floats, carried: Floats) -> Float
 
 
 def _geometry(robot: Robot) -> pin.GeometryModel:
+    root = parse_urdf(robot.urdf, robot.name)
+    text = flat_collisions(root) if has_many_fixed_links(root) else pinocchio_text(root, shapes="collision")
+    said: list[str] = []
     try:
-        geometry = pin.buildGeomFromUrdfString(robot.model, robot.urdf, pin.GeometryType.COLLISION)
+        with parser_heard(said):
+            geometry = pin.buildGeomFromUrdfString(robot.model, text, pin.GeometryType.COLLISION)
     except (ValueError, RuntimeError) as error:
-        why = " ".join(str(error).split())
+        why = "; ".join([*said, " ".join(str(error).split())])
         raise ModelError(
             f"robot '{robot.name}': a collision shape cannot be read; give its mesh a full path, or name the folder of "
             f"its package in ROS_PACKAGE_PATH: {why}"

@@ -25,15 +25,19 @@ _MATRIX, _ROWS, _VECTOR = "float64[::1, :]", "float64[:, ::1]", "float64[::1]"
 # Pinocchio's matrices are stored by columns, everything else by rows.
 _FROM_PINOCCHIO = f"{_MATRIX}, {_MATRIX}, {_ROWS}"
 _CONSTANTS = f"{_ROWS}, {_ROWS}, {_ROWS}, {_VECTOR}"
-SELECTIVE_COMMAND = f"int64({_FROM_PINOCCHIO}, {_CONSTANTS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR})"
+SELECTIVE_COMMAND = f"int64({_FROM_PINOCCHIO}, {_CONSTANTS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR})"
 
 # What selective_command returns.
 OK = 0
 NOT_FINITE = 1
 NO_INERTIA = 2
-NOT_UNIT_QUATERNION = 3
+NOT_UNIT = 3
 WRONG_SIZE = 4
 NOT_A_TARGET = 5
+OTHER_MASS = 6
+FAR_AWAY = 7  # the base stands farther than FAR from the inertial origin: nothing is computed
+
+UNIT = 1e-6  # how far a length of 1 may be off
 
 # Where the results stand in `out`: first Pinocchio's velocity v, base twist (6: linear, angular, base axes) and joint
 # rates (n), then the following, counted from 6 + n.
@@ -45,7 +49,14 @@ RATE_BLEND = 11  # 1, or less where acceleration limits held the rates back
 PLAN_CHANGE = 12  # relative change of the rates in the last pass of planning for a hold; 0 without a plan
 EXCESS = 13  # how far acceleration limits were exceeded, relative to them
 LIMITED = 14  # how many bounds the rates stand at, where each limit is kept by itself
-ERRORS = 15  # one a task row, then the smallest singular value of each level, then rho of each level
+LOST = 15  # largest difference between PROTECTED_RATE and what was asked for; 0 where it is rounding
+LOST_TO = 16  # what it was lost to: a sum of the following
+ERRORS = 17  # one a task row, then the smallest singular value of each level, then rho of each level
+
+# What a protected rate is lost to.
+TO_RANK = 1  # J_sub has not the rank for it
+TO_RATES = 2  # the joint rates that it takes exceed their limits
+TO_LIMITS = 4  # so it is where each limit is kept by itself: of position, rate or acceleration
 
 # Where the scalars stand in `parameters`.
 THRESHOLD = 0
@@ -110,6 +121,11 @@ EPS = 2.220446049250313e-16
 NOISE = 16.0 * EPS
 # Task rows whose rest is below this share of all are left out of their manipulability: its slope would be rounding.
 DEPENDENT = 1e-9
+# m, along any inertial axis, as in model/origin.py: sums about an origin that far away have lost a digit.
+FAR = 10.0
+# A protected rate is lost where more than this share of what joints and momentum do along it is missing: far above
+# rounding, far below what anyone would notice.
+LOST_SHARE = 1e-9
 # Rates are scaled to just inside the limit, so that no later rounding lifts one above it.
 INSIDE = 1.0 - 8.0 * EPS
 # The same for the change of a rate, which is a difference and so rounds more.
@@ -518,8 +534,8 @@ def add_matrices_at(
     n = columns.shape[1]
     mass = parameters[MASS]
     m_squared = A_g[0, 0] ** 2 + A_g[1, 0] ** 2 + A_g[2, 0] ** 2
-    if abs(m_squared - mass * mass) > 1e-6 * mass * mass:
-        return NOT_UNIT_QUATERNION
+    if abs(m_squared - mass * mass) > 1e-5 * mass * mass:
+        return OTHER_MASS
     if base_twist_map(A_g, J_base) == 0.0:
         return NO_INERTIA
     held = placements[int(parameters[TOOL_JOINT])]
@@ -760,21 +776,46 @@ def fixed_part(
     wanted: Floats,
     leak: Floats,
     q_dot: Floats,
-) -> None:
+) -> int:
     """Make q_dot (n,), zero on entry, the J_sub^+ b of minimum norm, and `wanted` (6,), b on entry, what it reaches.
 
     b gives way where J_sub has not the rank for it, to the nearest that there is, and where the rates would exceed
-    their limits, as a whole.
+    their limits, as a whole. Return which of the two, as LOST_TO has it.
     """
-    k = J_sub.shape[0]
+    k, lost_to = J_sub.shape[0], 0
     if rank < k:
+        before, whole, missing = wanted[:k].copy(), 0.0, 0.0
         nearest_attainable(rows, diagonal, order, k, rank, wanted)
+        for i in range(k):
+            whole, missing = max(whole, abs(before[i])), max(missing, abs(before[i] - wanted[i]))
+        lost_to = TO_RANK if missing > LOST_SHARE * whole else 0
     for _ in range(2):  # the second time takes out the rounding of the first
         take_out_leak(J_sub, rows, weights, diagonal, order, rank, wanted, columns[SCALE], leak, q_dot)
     leak[:] = 0.0
     factor = bring_within_limits(leak, q_dot, columns, 1.0)
     for i in range(k):
         wanted[i] *= factor
+    return lost_to + (TO_RATES if factor < 1.0 else 0)
+
+
+@compiled
+def tell_lost(
+    J_sub: Floats, q_dot: Floats, protected_drift: Floats, parameters: Floats, lost_to: int, results: Floats
+) -> None:
+    """Write LOST and LOST_TO into a command's results, of a command whose protected rates stand there.
+
+    `protected_drift` (k,) is what the momentum on board does along the protected directions.
+    """
+    lost, whole = 0.0, 0.0
+    for i in range(J_sub.shape[0]):
+        size = abs(parameters[WANTED_RATE + i]) + abs(protected_drift[i])
+        for j in range(q_dot.shape[0]):
+            size += abs(J_sub[i, j] * q_dot[j])
+        whole = max(whole, size)
+        lost = max(lost, abs(results[PROTECTED_RATE + i] - parameters[WANTED_RATE + i]))
+    missing = lost > LOST_SHARE * whole
+    results[LOST] = lost if missing else 0.0
+    results[LOST_TO] = lost_to if missing else 0.0
 
 
 @compiled
@@ -867,7 +908,7 @@ def solve(
     L, V, weights, starts = small[0:m], small[m : 2 * m], small[2 * m], small[2 * m + 1]
     diagonal, v, order = small[2 * m + 2], small[2 * m + 3, :m], small[2 * m + 4]
     wanted, part = small[2 * m + 5], small[2 * m + 6]
-    first, asked = 3, False
+    first, asked, lost_to = 3, False, 0
     for i in range(k):
         order[i] = i
         wanted[i] = parameters[WANTED_RATE + i]
@@ -896,7 +937,7 @@ def solve(
     far = 1.0 + abs(results[POSITION]) + abs(results[POSITION + 1]) + abs(results[POSITION + 2])
     rank = factor_protected_rows(rows, weights, diagonal, order, k, NOISE * far * np.sqrt(square))
     if asked:
-        fixed_part(J_sub, rows, weights, diagonal, order, rank, columns, wanted, leak, fixed)
+        lost_to = fixed_part(J_sub, rows, weights, diagonal, order, rank, columns, wanted, leak, fixed)
     meet_tasks(matrices, tasks, parameters, targets, velocities, rates, results, fixed, drift, asked, v)
 
     levels, at, row, i = int(parameters[LEVELS]), rank, 0, 0
@@ -964,6 +1005,14 @@ def solve(
                 results[PROTECTED_RATE + i] += J_sub[i, j] * q_dot[j]
     results[EXCESS] = 0.0
     results[LIMITED] = 0.0
+    results[LOST] = 0.0
+    results[LOST_TO] = 0.0
+    if asked:
+        for i in range(k):
+            part[i] = 0.0
+            for b in range(first, 6):
+                part[i] += U_c[b, i] * drift[source + b, 0]
+        tell_lost(J_sub, q_dot, part, parameters, lost_to, results)
     results[RATE_SCALE] = rate_scale
     results[RATE_BLEND] = blend
     results[RANK] = rank
@@ -980,12 +1029,16 @@ def log_manipulability(matrices: Floats, U_c: Floats, columns: Floats, parameter
     n, k = columns.shape[1], U_c.shape[1]
     rows, weights, diagonal, order = np.zeros((k + count, n)), np.empty(k + count), np.empty(k), np.zeros(k)
     source = J_PROTECTED if parameters[AXES_JOINT] >= 0.0 else J_BASE
-    square, size = 0.0, 0.0
+    square, size, first = 0.0, 0.0, 3
+    for i in range(k):
+        if U_c[0, i] != 0.0 or U_c[1, i] != 0.0 or U_c[2, i] != 0.0:
+            first = 0
     for j in range(n):
+        for b in range(first, 6):
+            square += (columns[SCALE, j] * matrices[source + b, j]) ** 2
         for i in range(k):
             for b in range(6):
                 rows[i, j] += columns[SCALE, j] * U_c[b, i] * matrices[source + b, j]
-            square += rows[i, j] ** 2
         for r in range(count):
             rows[k + r, j] = columns[SCALE, j] * matrices[J_TASK + r, j]
             size += rows[k + r, j] ** 2
@@ -1012,6 +1065,29 @@ def wrong_size(n: int, parameters: Floats, targets: Floats, velocities: Floats, 
     return vectors or previous.shape[0] != n or out.shape[0] != size
 
 
+@compiled_for("boolean(float64[::1], float64[:, ::1])")
+def off_unit(q: Floats, columns: Floats) -> bool:
+    """Say whether q is not finite, or its quaternion or the cosine and sine of a joint are not of unit length."""
+    for i in range(q.shape[0]):
+        if not abs(q[i]) < np.inf:
+            return True
+    if not abs(np.sqrt(q[3] ** 2 + q[4] ** 2 + q[5] ** 2 + q[6] ** 2) - 1.0) <= UNIT:
+        return True
+    for j in range(columns.shape[1]):
+        if columns[CONTINUOUS, j] > 0.0:
+            place = int(columns[PLACE, j])
+            if not abs(np.sqrt(q[place] ** 2 + q[place + 1] ** 2) - 1.0) <= UNIT:
+                return True
+    return False
+
+
+@inlined
+def far_away(placements: Floats) -> bool:
+    """Say whether the base, the first joint, is so far from the inertial origin that sums about it lose digits."""
+    base = placements[1]
+    return abs(base[9]) > FAR or abs(base[10]) > FAR or abs(base[11]) > FAR
+
+
 @compiled_for(SELECTIVE_COMMAND)
 def selective_command(
     A_g: Floats,
@@ -1025,6 +1101,7 @@ def selective_command(
     velocities: Floats,
     previous: Floats,
     out: Floats,
+    q: Floats,
 ) -> int:
     """Write q_dot = (J_gt N_sub)^+ v_cmd, or what the tasks make of it, and what follows into `out`.
 
@@ -1042,14 +1119,20 @@ def selective_command(
         velocities: Theirs, m/s or rad/s, a number a task row, of a direction three.
         previous: The rates commanded before (n,); read only where RATE_STEP limits something.
         out: (6 + n + ERRORS + task rows + 2 levels,), overwritten.
+        q: The configuration (nq,) that Pinocchio was given, whose length it has looked at.
 
     Returns:
-        OK, NOT_FINITE (in the configuration or the targets), NO_INERTIA (H_ww is singular), NOT_UNIT_QUATERNION,
-        WRONG_SIZE (of targets, of `previous` or of `out`) or NOT_A_TARGET (no rotation or no direction).
+        OK, NOT_FINITE (in the configuration or the targets), NO_INERTIA (H_ww is singular), NOT_UNIT (the quaternion,
+        or the cosine and sine of a joint), WRONG_SIZE (of targets, of `previous` or of `out`), NOT_A_TARGET (no
+        rotation or no direction), OTHER_MASS (A_g is not of the robot's mass) or FAR_AWAY.
     """
     n, m = columns.shape[1], int(parameters[TASK_ROWS])
     if wrong_size(n, parameters, targets, velocities, previous, out):
         return WRONG_SIZE
+    if off_unit(q, columns):
+        return NOT_UNIT
+    if far_away(placements):
+        return FAR_AWAY
     # Two allocations for all scratch: each costs as much as a reflection.
     work, small = np.empty((J_TASK + 22 + 2 * m, n)), np.empty((max(2 * m + 7, 11) + 1, 6 + m))
     drift = np.zeros((J_TASK + m, 1))
@@ -1167,17 +1250,6 @@ def read_joints(q: Floats, columns: Floats) -> None:
             columns[JOINT_POSITION, j] = np.arctan2(q[place + 1], q[place])
 
 
-@compiled_for("boolean(float64[::1], int64[::1])")
-def off_circle(q: Floats, starts: Floats) -> bool:
-    """Say whether a cosine and sine in q, at one of the given places, are not of unit length."""
-    for i in range(starts.shape[0]):
-        start = starts[i]
-        square = q[start] ** 2 + q[start + 1] ** 2
-        if not abs(square - 1.0) < 1e-6:
-            return True
-    return False
-
-
 @compiled
 def change_of(rates: Floats, before: Floats) -> float:
     """Return how far rates (n,) differ from those before, relative to the largest, and remember them there."""
@@ -1289,6 +1361,10 @@ def pose_command(
     """Do what `selective_command` does, and write what it has solved into the other arrays, by `pose_rows`."""
     if wrong_size(columns.shape[1], parameters, targets, velocities, previous, out):
         return WRONG_SIZE
+    if off_unit(q, columns):
+        return NOT_UNIT
+    if far_away(placements):
+        return FAR_AWAY
     read_joints(q, columns)
     matrices[:] = 0.0
     drift[:] = 0.0
@@ -1320,10 +1396,21 @@ def pose_command(
 
 @compiled
 def take_rates(
-    matrices: Floats, drift: Floats, U_c: Floats, columns: Floats, parameters: Floats, found: Floats, out: Floats
+    matrices: Floats,
+    drift: Floats,
+    U_c: Floats,
+    columns: Floats,
+    parameters: Floats,
+    found: Floats,
+    limited: bool,
+    out: Floats,
 ) -> None:
-    """Write other joint rates (n,), over SCALE, into a command, and the base twist and protected rate that follow."""
-    n, k = columns.shape[1], U_c.shape[1]
+    """Write other joint rates (n,), over SCALE, into a command, and the base twist and protected rate that follow.
+
+    `limited` says that what is wanted of the protected rate has yielded to limits.
+    """
+    n, k, results = columns.shape[1], U_c.shape[1], out[6 + columns.shape[1] :]
+    rows, moved = np.empty((k, n)), np.empty(k)
     source = J_PROTECTED if parameters[AXES_JOINT] >= 0.0 else J_BASE
     for j in range(n):
         out[6 + j] = columns[SCALE, j] * found[j]
@@ -1332,15 +1419,40 @@ def take_rates(
         for j in range(n):
             out[b] += matrices[J_BASE + b, j] * out[6 + j]
     for i in range(k):
-        rate = 0.0
+        moved[i] = 0.0
         for b in range(6):
-            rate += U_c[b, i] * drift[source + b, 0]
+            moved[i] += U_c[b, i] * drift[source + b, 0]
+        rate = moved[i]
         for j in range(n):
-            J_sub = 0.0
+            rows[i, j] = 0.0
             for b in range(6):
-                J_sub += U_c[b, i] * matrices[source + b, j]
-            rate += J_sub * out[6 + j]
-        out[6 + n + PROTECTED_RATE + i] = rate
+                rows[i, j] += U_c[b, i] * matrices[source + b, j]
+            rate += rows[i, j] * out[6 + j]
+        results[PROTECTED_RATE + i] = rate
+    lost_to = int(results[LOST_TO]) | (TO_LIMITS if limited else 0)
+    tell_lost(rows, out[6 : 6 + n], moved, parameters, lost_to, results)
+
+
+@compiled_for(f"float64[:, ::1]({_ROWS}, {_ROWS}, float64)")
+def past_protected(J_sub: Floats, J_task: Floats, noise: float) -> Floats:
+    """Return J_task N_sub (m, n), N_sub being the null space that the law finds: rows of J_sub below `noise` are none.
+
+    The columns of both are over SCALE.
+    """
+    (k, n), m = J_sub.shape, J_task.shape[0]
+    rows, weights, diagonal, order = np.zeros((k + m, n)), np.empty(k + m), np.empty(k), np.zeros(k)
+    for j in range(n):
+        for i in range(k):
+            rows[i, j] = J_sub[i, j]
+        for r in range(m):
+            rows[k + r, j] = J_task[r, j]
+    rank = factor_protected_rows(rows, weights, diagonal, order, k, noise)
+    left = rows[k:].copy()
+    for r in range(m):
+        left[r, :rank] = 0.0
+        for i in range(rank - 1, -1, -1):
+            apply_reflection(rows, weights, i, i, left[r])
+    return left
 
 
 @compiled_for(f"int64({_ROWS}, {_ROWS}, {_VECTOR}, {_VECTOR}, {_VECTOR}, {_VECTOR}, float64, float64, {_VECTOR})")

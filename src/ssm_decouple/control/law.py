@@ -13,10 +13,22 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.task import Layout, PositionTask, Task, checked_tasks
-from ssm_decouple.errors import DecoupleWarning, InputError, as_floats, as_not_negative, as_number, as_positive
-from ssm_decouple.model.robot import Robot, per_joint
-from ssm_decouple.momentum.flow import munthe_kaas
-from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.errors import (
+    DecoupleWarning,
+    InputError,
+    as_floats,
+    as_kind,
+    as_not_negative,
+    as_number,
+    as_positive,
+    as_whole,
+    shown,
+)
+from ssm_decouple.model.origin import from_base
+from ssm_decouple.model.robot import Robot, checked_robot, per_joint, warn_of_degrees
+from ssm_decouple.momentum.flow import munthe_kaas, places_on_hold, quadrature_along, ways_to_nodes
+from ssm_decouple.momentum.protection import Protection, checked_protection
+from ssm_decouple.settled import Settled, fixed_array
 
 if TYPE_CHECKING:
     from ssm_decouple.control.limits import LimitedRates, LimitedStep, Limits
@@ -31,13 +43,29 @@ GAUSS: dict[int, tuple[tuple[float, float], ...]] = {
     3: ((0.5 - np.sqrt(15) / 10, 5 / 18), (0.5, 4 / 9), (0.5 + np.sqrt(15) / 10, 5 / 18)),
 }
 # One look-up instead of two, in every step.
-centroidal_map, selective_command = pin.computeCentroidalMap, kernel.selective_command
+centroidal_map, selective_command, array = pin.computeCentroidalMap, kernel.selective_command, np.ndarray
+
+FASTEST = 2 * np.pi  # rad/s: above it a joint's rate limit looks like degrees
+
+FULL = 1.0  # the pace of a command that is asked for nothing else
 
 CLIMB_STEP = 1e-6  # rad or m, of the finite differences
 CLIMB_SHARE = 0.25  # of the rate limits
 
 PASSES = 12  # at most; away from singularities each gains a factor of about sample time x joint rate
 CONVERGED = 1e-13  # relative change of the rates from pass to pass
+
+# What a protected rate is lost to, in words.
+LOST_TO = {
+    kernel.TO_RANK: "no joint rates give it: J_sub has lost rank",
+    kernel.TO_RATES: "the joint rates that it takes exceed the rate limits",
+    kernel.TO_LIMITS: "the joint rates that it takes exceed position, rate or acceleration limits",
+}
+
+
+def lost_to(code: float) -> tuple[str, ...]:
+    """Return in words what a protected rate was lost to, by the kernel's number."""
+    return tuple(words for bit, words in LOST_TO.items() if int(code) & bit)
 
 
 class CommandedMotion:
@@ -72,8 +100,9 @@ class CommandedMotion:
     def protected_rate(self) -> Floats:
         """Constrained disturbance angular velocity w_sub = J_sub q_dot (.., k), rad/s (paper, eq. 6): rounding.
 
-        Of a law with hold nodes, its mean over the hold. Where a rate was asked for it is that rate, or what of it the
-        arm and its rate limits can give. With directions of the whole twist it mixes m/s and rad/s.
+        Of a law with hold nodes, its mean over the hold, on these nodes. Where a rate was asked for it is that rate, or
+        what of it the arm and its rate limits can give; so it is with zero where there is momentum on board. With
+        directions of the whole twist it mixes m/s and rad/s.
         """
         return self._results(kernel.PROTECTED_RATE, self.k)
 
@@ -167,6 +196,19 @@ class Command(CommandedMotion):
         return int(self._results(kernel.LIMITED)[0])
 
     @property
+    def protection_lost(self) -> float:
+        """Largest difference between the protected rate and what was asked for, rad/s (or m/s); 0 where it is kept.
+
+        Kept to rounding, that is: to 1e-9 of what joints and momentum do along the protected directions.
+        """
+        return float(self._results(kernel.LOST)[0])
+
+    @property
+    def protection_lost_to(self) -> tuple[str, ...]:
+        """Why the protected rate is not what was asked for, in words; nothing where it is."""
+        return lost_to(float(self._results(kernel.LOST_TO)[0]))
+
+    @property
     def plan_change(self) -> float:
         """Relative change of the rates in the last pass of planning for the hold: above 1e-13 it has not settled."""
         return float(self._results(kernel.PLAN_CHANGE)[0])
@@ -220,7 +262,7 @@ class LostDirection:
         }
 
 
-class SelectiveLaw:
+class SelectiveLaw(Settled):
     """The paper's law: q_dot = (J_gt N_sub)^+ (x_dot_des + k_p (x_des - x)), scaled as a whole to the rate limits.
 
     Equations 9 and 17; the paper gives the limits and leaves open how they are kept.
@@ -235,7 +277,8 @@ class SelectiveLaw:
     A command that is held until the next sample keeps the joints turning while J_sub moves on, so that a base which is
     still at the sample turns a little in between. With `hold_nodes` the law is posed on matrices averaged over the
     coming hold instead: at the middle (1), or at 2 or 3 Gauss points, along the motion that the command itself causes.
-    Then the *rotation* about a direction fixed in base axes is zero over the hold, to the quadrature's order.
+    Then the *rotation* about a direction is zero over the hold, to the quadrature's order, in whatever axes it is
+    fixed.
 
     Other tasks than the end-effector's position take its place in the same formula: J_1, the rows of all tasks of level
     1, each times the root of its task's weight, stands for J_gt. A second level acts in what the protection and J_1
@@ -243,21 +286,27 @@ class SelectiveLaw:
 
     Momentum on board, such as what a push or spinning wheels have left, moves the base even while the joints stand
     still. The law takes that off what it asks of the joints: the protected rate stays zero as long as the joints can
-    take the momentum up, and the tasks are met beside it.
+    take the momentum up, and the tasks are met beside it. A command tells by `protection_lost` where they cannot.
 
-    A law holds Pinocchio's scratch memory: use one law in one thread.
+    Where the base is far from the inertial origin the law computes in axes through the base.
+
+    A law holds Pinocchio's scratch memory: use one law in one thread. Its settings are read when it is made and cannot
+    be assigned afterwards, but for `momentum`, which acts.
 
     Args:
         robot: The robot.
         protection: The directions about which the base must not turn.
         gain: Tracking gain k_p, 1/s, of the tasks that name none.
         rate_limit: Largest joint rates, rad/s or m/s: one number, an array (n,), or None for the URDF's.
-        damping: rho at a singularity, m2; 0 gives the Moore-Penrose inverse everywhere.
+        damping: rho at a singularity, m2; 0 gives the Moore-Penrose inverse everywhere. For commands that are held it
+            should be above the sample time times the speed asked for times the arm's length, or rates may reverse from
+            sample to sample there.
         damping_threshold: Smallest singular value, m, below which rho enters.
         sample_time: How long a command is held, s; needed for the two that follow and for `limits`.
         hold_nodes: 0 poses the law at the sample, 1 to 3 on matrices averaged over the hold.
         acceleration_limit: Largest joint accelerations, rad/s2 or m/s2, from one command to the next: one number, an
-            array (n,), or None. The rates are blended from the previous ones within null(J_sub). The protection comes
+            array (n,), or None; `robot.acceleration_limits` is what the motors of reaction wheels can do. The rates are
+            blended from the previous ones within null(J_sub). The protection comes
             first, then the rate limits: where they take more than the acceleration limit allows, it is exceeded and
             the command's `rate_blend` is 0. Without `limits` the law does not brake ahead.
         tasks: What the arm shall do: one task or several; None is the end-effector's position, `PositionTask()`.
@@ -274,13 +323,16 @@ class SelectiveLaw:
     Attributes:
         size: Length of the array that `evaluate` fills.
         joint_weights: (n,), as given or by default.
-        limited: Of a law with `limits`, what they did to the last command.
         tasks: The tasks, a tuple.
         layout: Where their rows and targets stand.
 
     Raises:
         InputError: a number that is not positive (damping may be 0), a wrong shape, a missing sample time, a robot
             without joints, a task that the robot cannot do, or a protection that takes all freedoms of the tasks.
+        ModelError: `robot.model` was changed after the robot was made.
+
+    Warns:
+        DecoupleWarning: a rate limit that looks like degrees.
     """
 
     def __init__(
@@ -299,19 +351,19 @@ class SelectiveLaw:
         momentum: ArrayLike | None = None,
         limits: Limits | None = None,
     ) -> None:
-        n = robot.n_joints
+        n = checked_robot(robot).n_joints
         if n == 0:
             raise InputError(f"'{robot.name}' has no joints to command; put an arm on it with compose(..)")
-        if not isinstance(protection, Protection):
-            raise InputError(f"protection is {protection!r}; give a Protection, such as Protection('yaw')")
-        if not (isinstance(hold_nodes, int) and hold_nodes in GAUSS):
+        robot.refuse_changed_model()
+        hold_nodes = as_whole("hold_nodes", hold_nodes, 0, "it is 0 (at the sample), 1, 2 or 3")
+        if hold_nodes not in GAUSS:
             raise InputError(f"hold_nodes is {hold_nodes}; it is 0 (at the sample), 1, 2 or 3")
         if sample_time is None and (hold_nodes or acceleration_limit is not None or limits is not None):
             raise InputError(
                 "hold_nodes, acceleration_limit and limits need the sample_time, s, for which a command is held"
             )
         self.robot = robot
-        self.protection = protection
+        self.protection = checked_protection(protection)
         self.gain = as_positive("gain", gain)
         self.damping = as_not_negative("damping", damping)
         self.damping_threshold = as_positive("damping_threshold", damping_threshold)
@@ -320,19 +372,21 @@ class SelectiveLaw:
         self.rate_limits: Floats = per_joint(
             robot, "rate_limit", robot.rate_limits if rate_limit is None else rate_limit
         )
+        if rate_limit is not None:
+            warn_of_degrees(robot, "rate_limit", self.rate_limits, FASTEST, "rad/s")
         self.acceleration_limits: Floats | None = None
         if acceleration_limit is not None:
             self.acceleration_limits = per_joint(robot, "acceleration_limit", acceleration_limit)
         self.joint_weights: Floats = (
-            _default_weights(robot, self.rate_limits)
+            fixed_array(_default_weights(robot, self.rate_limits))
             if joint_weights is None
             else per_joint(robot, "joint_weights", joint_weights, "finite")
         )
         self.tasks = (PositionTask(),) if tasks is None else checked_tasks(robot, tasks)
         self.layout = Layout(robot, self.tasks, self.gain)
         self.size: int = 6 + n + kernel.ERRORS + self.layout.size + 2 * len(self.layout.level_rows)
-        self.limits = limits
-        self.limited: LimitedRates | None = None
+        self.limits = None if limits is None else _checked_limits(limits)
+        self._limited: LimitedRates | None = None
         self._step: LimitedStep | None = None
         self._prepare()
         self._set_momentum(momentum)
@@ -340,6 +394,11 @@ class SelectiveLaw:
             self._prepare_limits(limits)
         if tasks is not None:
             self._refuse_what_nothing_is_left_for()
+
+    @property
+    def limited(self) -> LimitedRates | None:
+        """Of a law with `limits`, what they did to the last command."""
+        return self._limited
 
     @property
     def directions(self) -> tuple[Floats, str]:
@@ -366,14 +425,26 @@ class SelectiveLaw:
     def momentum(self, momentum: ArrayLike | None) -> None:
         self._set_momentum(momentum)
 
+    def seen_from(self, origin: Floats) -> SelectiveLaw:
+        """Return the law for configurations whose base position is counted from another origin (3,), m.
+
+        It is this one: nothing in it depends on where the base is.
+        """
+        return self
+
     def _set_momentum(self, momentum: ArrayLike | None) -> None:
         values = np.zeros(6) if momentum is None else as_floats("momentum", momentum)
         if values.shape != (6,) or not np.all(np.isfinite(values)):
             raise InputError(
-                f"momentum is {values.tolist()}; it needs 6 finite numbers, linear and angular about the centre of "
-                "mass, inertial axes"
+                f"momentum is {shown(values.tolist())}; it needs 6 finite numbers, linear and angular about the centre "
+                "of mass, inertial axes"
             )
         self._prepared[3][3][kernel.MOMENTUM :] = values
+
+    @property
+    def _turning(self) -> bool:
+        """Whether the plan for a hold needs the base's attitude on the way, and can have it without momentum."""
+        return self.protection.frame == "inertial" and not self._prepared[3][3][kernel.MOMENTUM :].any()
 
     def _refuse_what_nothing_is_left_for(self) -> None:
         """Count freedoms where the arm stands nowhere special."""
@@ -401,7 +472,7 @@ class SelectiveLaw:
     def _matrices_at(self, q: Floats) -> Floats:
         """Return the kernel's matrices (J_TASK + m, n) at q; they depend on no target."""
         model, data, _, (_, _, columns, _), fixed = self._prepared
-        pin.computeCentroidalMap(model, data, q)
+        pin.computeCentroidalMap(model, data, from_base(q))
         if self._reads_joints:
             kernel.read_joints(q, columns)
         matrices, drift, rates = np.zeros_like(self._matrices), np.zeros_like(self._drift), np.zeros(self.layout.size)
@@ -447,23 +518,21 @@ class SelectiveLaw:
         places, continuous = [float(joint.idx_q) for joint in joints], [float(joint.nq == 2) for joint in joints]
         scale = 1.0 / np.sqrt(self.joint_weights)
         columns = np.vstack([self.rate_limits, steps, places, continuous, np.zeros(n), scale, layout.moves])
-        data = model.createData()
+        data = pin.Data(model)
         # Live views into the Pinocchio data, fetched once: each fetch would cost as much as a tenth of the step.
         views = (data.Ag, data.J, _placements(data, model.njoints))
-        constants = (U_c, layout.table, columns, parameters)
+        constants = (U_c, layout.table.copy(), columns, parameters)
         self._prepared = (model, data, views, constants, (*views, *constants))
         self._reads_joints = bool(np.any(layout.table[:, kernel.KIND] == kernel.JOINTS))
-        self._flat = layout.plain
+        self._flat, self._climbs = layout.plain, layout.climbs
+        self._quick = not self._reads_joints  # and no limits
         self._at_rest: Floats = np.zeros(layout.target_sizes[1])  # writable, as the kernel wants it; never written
-        # Where continuous joints keep cosine and sine: the matrices do not tell whether these fit.
-        circles = np.array([joint.idx_q for joint in model.joints[2:] if joint.nq == 2], dtype=np.int64)
-        self._circles = circles if circles.size else None
-        self._looks_at_q = self._reads_joints or self._circles is not None
         self._n, self._k = n, self.protection.k
         self._no_rates: Floats = np.zeros(n)
         self._any_target: Floats = layout.any_target()
         self._J_base: Floats = np.zeros((6, n))
         self._J_here: Floats = np.zeros((6, n))
+        self._J_nodes: Floats = np.zeros((self.hold_nodes, 6, n))
         self._matrices: Floats = np.zeros((kernel.J_TASK + layout.size, n))
         self._drift: Floats = np.zeros((kernel.J_TASK + layout.size, 1))
         self._later: Floats = np.zeros(layout.target_sizes[0])
@@ -478,6 +547,7 @@ class SelectiveLaw:
         layout, scale = self.layout, 1.0 / np.sqrt(self.joint_weights)
         _, _, _, (_, _, columns, parameters), _ = self._prepared
         columns[kernel.RATE_LIMIT], parameters[kernel.LIMITS_STEPS] = np.inf, 0.0
+        self._quick = False
         accelerations = self.acceleration_limits
         self._step = LimitedStep(
             self.robot,
@@ -515,7 +585,7 @@ class SelectiveLaw:
         target_velocity: Any = None,
         previous_rates: ArrayLike | None = None,
         protected_rate: ArrayLike | None = None,
-        pace: float = 1.0,
+        pace: float = FULL,
         time: float = 0.0,
     ) -> Command:
         """Return the command at a configuration.
@@ -562,7 +632,7 @@ class SelectiveLaw:
         out: Floats,
         previous_rates: ArrayLike | None = None,
         protected_rate: ArrayLike | None = None,
-        pace: float = 1.0,
+        pace: float = FULL,
         time: float = 0.0,
     ) -> None:
         """Compute a command into an array: the same as calling the law, without the result object.
@@ -581,7 +651,7 @@ class SelectiveLaw:
         Raises:
             InputError: as for the call.
         """
-        if protected_rate is not None or pace != 1.0:
+        if protected_rate is not None or not (pace is FULL or (type(pace) is float and pace == 1.0)):
             _, _, _, (*_, parameters), _ = self._prepared
             usual = parameters.copy()
             parameters[kernel.PACE : kernel.MOMENTUM] = self._asked(protected_rate, pace)
@@ -594,40 +664,59 @@ class SelectiveLaw:
             if self.acceleration_limits is not None:
                 raise InputError("an acceleration limit needs previous_rates: those commanded before, zeros from rest")
             previous_rates = self._no_rates
-        if self.layout.climbs is not None:
-            place, gain = self.layout.climbs
+        elif type(previous_rates) is not array:
+            previous_rates = self._checked_rates(previous_rates)
+        if self._climbs is not None:
+            place, gain = self._climbs
             velocities = self._flat_vectors(target, target_velocity)[1].copy()
             velocities[place] = self._rates_that_climb(q, gain)
             target_velocity = velocities
-        model, data, _, constants, fixed = self._prepared
+        model, data, _, _, fixed = self._prepared
         try:  # arrays of the right kind are not looked at twice
+            if not (type(q) is type(target) is type(target_velocity) is type(out) is array):
+                raise TypeError  # a subclass: a masked array would pass as what lies under its mask
             centroidal_map(model, data, q)
-            if self._looks_at_q:
-                if self._circles is not None and kernel.off_circle(q, self._circles):  # type: ignore[arg-type]
-                    self.robot.checked(q)
-                if self._reads_joints:
-                    kernel.read_joints(q, constants[2])  # type: ignore[arg-type]
+            # A q that Pinocchio reads in its own way, such as one of another byte order, does not fit here.
             status = (
-                selective_command(*fixed, target, target_velocity, previous_rates, out)  # type: ignore[arg-type]
-                if self._step is None
-                else self._limited_command(q, target, target_velocity, previous_rates, out)
+                selective_command(*fixed, target, target_velocity, previous_rates, out, q)
+                if self._quick
+                else self._other_command(q, target, target_velocity, previous_rates, out)
             )
         except (TypeError, ValueError):  # a list, another layout, a read-only array or a wrong length
             q = self.robot.checked(q)
             target, target_velocity = self._flat_vectors(target, target_velocity)
             previous_rates = self._checked_rates(previous_rates)
             pin.computeCentroidalMap(model, data, q)
-            kernel.read_joints(q, constants[2])
             out = self._checked_out(out)
-            status = (
-                kernel.selective_command(*fixed, target, target_velocity, previous_rates, out)
-                if self._step is None
-                else self._limited_command(q, target, target_velocity, previous_rates, out)
-            )
+            status = self._other_command(q, target, target_velocity, previous_rates, out)
         if self.hold_nodes and status == kernel.OK:
             status = self._hold(q, np.asarray(target), np.asarray(target_velocity), np.asarray(previous_rates), out)
         if status:
-            self._refuse(q, target, target_velocity, previous_rates, out, status)
+            if status == kernel.FAR_AWAY:
+                self._evaluate_from_base(q, target, target_velocity, out, previous_rates)
+            else:
+                self._refuse(q, target, target_velocity, previous_rates, out, status)
+
+    def _evaluate_from_base(
+        self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, out: Floats, previous: ArrayLike
+    ) -> None:
+        """Compute a command in inertial axes through the base origin, which is far from the inertial one."""
+        near = self.robot.checked(q).copy()
+        origin = near[:3].copy()
+        near[:3] = 0.0
+        targets, velocities = self._flat_vectors(target, target_velocity)
+        self.evaluate(near, self.layout.targets_from(origin, targets), velocities, out, previous)
+        out[6 + self._n + kernel.POSITION :][:3] += origin
+
+    def _other_command(
+        self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, previous: ArrayLike, out: Floats
+    ) -> int:
+        """Do what `selective_command` does for a law that reads joint positions or brings its rates inside limits."""
+        if self._step is not None:
+            return self._limited_command(q, target, target_velocity, previous, out)
+        _, _, _, (_, _, columns, _), fixed = self._prepared
+        kernel.read_joints(q, columns)  # type: ignore[arg-type]
+        return selective_command(*fixed, target, target_velocity, previous, out, q)  # type: ignore[arg-type]
 
     def _limited_command(
         self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, previous: ArrayLike, out: Floats
@@ -660,17 +749,17 @@ class SelectiveLaw:
         ]
         if goal is not None:
             levels = [(np.eye(n), goal if scale is None else goal / scale, 0.0)]
-        self.limited = self._step(
+        self._limited = self._step(
             positions, previous, plain, rows[:k], sides[:k], levels, apart, distances, float(sides[-1])
         )
-        found = self.limited.joint_rates
+        found = self._limited.joint_rates
         if found is plain:
             return
-        if scale is not None:  # take out what the rounding of the scaling leaves in the protected rows
-            J_sub = rows[:k] / scale
-            found = found - np.linalg.pinv(rows[:k]) @ (J_sub @ (scale * found) - self.limited.share * sides[:k])
-        kernel.take_rates(self._matrices, self._drift, U_c, columns, parameters, found, out)
-        results[kernel.EXCESS], results[kernel.LIMITED] = self.limited.excess, self.limited.count
+        if scale is not None:
+            self._step.take_out_rounding(rows[:k], scale, self._limited)
+        limited = self._limited.share < 1.0 - kernel.LOST_SHARE
+        kernel.take_rates(self._matrices, self._drift, U_c, columns, parameters, found, limited, out)
+        results[kernel.EXCESS], results[kernel.LIMITED] = self._limited.excess, self._limited.count
 
     def check_start(self, q: ArrayLike) -> None:
         """Look at a start configuration before a motion; a law without `limits` has nothing to say.
@@ -702,13 +791,56 @@ class SelectiveLaw:
         """Return the base twist (6,), base axes, that joint rates (n,) and the momentum on board cause at q.
 
         Without momentum it is `Coupling.base_twist`, but quick.
+
+        Raises:
+            InputError: as for the call.
         """
-        model, data, (A_g, *_), (*_, parameters), _ = self._prepared
-        pin.computeCentroidalMap(model, data, q)
+        model, data, (A_g, *_), (_, _, columns, parameters), _ = self._prepared
+        plain = type(q) is array and q.dtype == np.float64 and q.shape == (model.nq,) and q.flags.carray
+        if not plain or kernel.off_unit(q, columns):
+            q = self.robot.checked(q)
+        plain = type(joint_rates) is array and joint_rates.dtype == np.float64 and joint_rates.shape == (self._n,)
+        if not (plain and joint_rates.flags.c_contiguous):
+            joint_rates = self._checked_rates(joint_rates)
+        pin.computeCentroidalMap(model, data, from_base(q))
         kernel.base_twist_map(A_g, self._J_base)
         twist = self._J_base @ joint_rates
         momentum = parameters[kernel.MOMENTUM :]
         return twist + np.linalg.solve(A_g[:, :6], momentum) if momentum.any() else twist
+
+    def rotation_to_axes(self, q: Floats) -> Floats | None:
+        """Return the rotation (3, 3) at q from base axes to those in which `directions` are fixed.
+
+        None where those are base axes.
+        """
+        frame = self.directions[1]
+        if frame == "base":
+            return None
+        model, data, *_ = self._prepared
+        pin.forwardKinematics(model, data, q)
+        R: Floats = data.oMi[1].rotation
+        if frame == "inertial":
+            return R.copy()
+        held = model.frames[self.robot.frame_id(frame)]
+        return (data.oMi[held.parentJoint].rotation @ held.placement.rotation).T @ R
+
+    def mean_twist(self, q: Floats, joint_rates: Floats) -> Floats:
+        """Return the mean base twist (6,) over the hold of joint rates (n,) from q, in the axes of `directions`.
+
+        It is taken on the law's own Gauss points, as the law plans; without hold nodes it is the twist at q.
+        """
+        model, hold, nodes = self.robot.model, float(self.sample_time or 0.0), GAUSS[self.hold_nodes]
+        drifting, velocity = bool(self.momentum.any()), np.r_[np.zeros(6), joint_rates]
+        if not nodes:
+            places = q[None]
+        elif drifting:
+            places = np.array([self._after(q, velocity, i) for i in range(len(nodes))])
+        else:
+            places = np.array([pin.integrate(model, q, node * hold * velocity) for node, _ in nodes])
+        twists = np.array([self.base_twist(place, joint_rates) for place in places])
+        if nodes and not drifting:
+            places = places_on_hold(model, q, joint_rates, hold, twists)
+        return quadrature_along(self.rotation_to_axes, places, twists, 1.0)
 
     def lost_direction(self, q: ArrayLike) -> LostDirection:
         """Return the direction that the tasks of level 1 can move in least at q, and which protected row takes it.
@@ -718,12 +850,16 @@ class SelectiveLaw:
         Raises:
             InputError: q has the wrong length or is not finite.
         """
-        checked, scale = self.robot.checked(q), 1.0 / np.sqrt(self.joint_weights)
+        checked, scale = from_base(self.robot.checked(q)), 1.0 / np.sqrt(self.joint_weights)
         J = scale * self._task_jacobian(checked)[self.layout.level_rows[0]]
-        J_sub = scale * self.protection.J_sub(self.robot.coupling(checked))
+        coupling = self.robot.coupling(checked)
+        J_sub = scale * self.protection.J_sub(coupling)
+        first = 0 if self.protection.U_twist[:3].any() else 3
+        far = 1.0 + float(np.abs(self.robot.frame_pose(checked).translation).sum())
+        noise = kernel.NOISE * far * float(np.linalg.norm(scale * coupling.J_base[first:]))
 
         def left_by(rows: Floats) -> Floats:
-            return J - (J @ np.linalg.pinv(rows)) @ rows if len(rows) else J
+            return kernel.past_protected(np.ascontiguousarray(rows), np.ascontiguousarray(J), noise)
 
         direction = np.linalg.svd(left_by(J_sub))[0][:, -1]
         without = [float(np.linalg.norm(direction @ left_by(np.delete(J_sub, i, axis=0)))) for i in range(self._k)]
@@ -750,7 +886,8 @@ class SelectiveLaw:
             columns[kernel.RATE_STEP], parameters[kernel.LIMITS_STEPS] = 0.0, 1.0
             settings, last = (columns, parameters), velocity[6:].copy()
             status, change = self._plan(q, settings, target_velocity, last, out, previous)
-            kept[: kernel.POSITION] = results[: kernel.POSITION]
+            told = (*range(kernel.POSITION), kernel.LOST, kernel.LOST_TO)
+            kept[[*told]] = results[[*told]]
             results[:] = kept
         results[kernel.POSITION :][:3], errors[:] = kept_position, kept_errors  # as the base twist
         results[kernel.PLAN_CHANGE] = change
@@ -769,18 +906,23 @@ class SelectiveLaw:
 
         Where `previous` are rates to be projected, `commanded` are those that were commanded before.
         """
-        model, data, _, (U_c, tasks, columns, _), fixed = self._prepared
+        model, data, views, (U_c, tasks, columns, _), fixed = self._prepared
         hold, matrices, drift, rates = float(self.sample_time or 0.0), self._matrices, self._drift, self._rates
         targets = self._later
         velocity, results = out[: model.nv], out[model.nv :]
         position, errors = results[kernel.POSITION :][:3], results[kernel.ERRORS :][: self.layout.size]
         status, change, before = kernel.OK, np.inf, velocity[6:].copy()
+        nodes, turning = GAUSS[self.hold_nodes], self._turning
+        if turning:
+            self._ways = hold * np.outer([node for node, _ in nodes], velocity[:6])
         for _ in range(PASSES):
             for total in (matrices, drift, rates, position, errors):
                 total[:] = 0.0
-            for node, weight in GAUSS[self.hold_nodes]:
-                moved = self._after(q, velocity, node * hold)
+            for i, (_, weight) in enumerate(nodes):
+                moved = self._after(q, velocity, i)
                 pin.computeCentroidalMap(model, data, moved)
+                if turning:
+                    kernel.base_twist_map(views[0], self._J_nodes[i])
                 if self._reads_joints:
                     kernel.read_joints(moved, columns)
                 status = status or kernel.add_matrices(*fixed, targets, velocities, weight, matrices, drift, rates, out)
@@ -796,19 +938,26 @@ class SelectiveLaw:
                 else:
                     self._bring_inside(q, commanded, out, goal=previous)
             velocity[:6] = self._J_here @ velocity[6:] + self._base_drift
+            if turning:
+                self._ways = ways_to_nodes(self._J_nodes @ velocity[6:], hold)
             change = kernel.change_of(velocity[6:], before)
             if status != kernel.OK or change <= CONVERGED:
                 break
         return status, change
 
-    def _after(self, q: ArrayLike, velocity: Floats, time: float) -> Floats:
-        """Return where joint rates that are held lead.
+    def _after(self, q: ArrayLike, velocity: Floats, node: int) -> Floats:
+        """Return where joint rates that are held lead until a Gauss node of the hold.
 
-        Without momentum no matrix depends on where the base is, so that its first twist will do.
+        Directions fixed in inertial axes need the attitude there: it comes from the twists at all nodes in the pass
+        before, so that it settles with the rates. Of directions fixed in base axes or those of a link no matrix depends
+        on where the base is, so that its first twist will do. With momentum on board the base is led there step by
+        step.
         """
+        time, rates = GAUSS[self.hold_nodes][node][0] * float(self.sample_time or 0.0), velocity[6:]
+        if self._turning:
+            return pin.integrate(self.robot.model, q, np.r_[self._ways[node], time * rates])
         if not self._prepared[3][3][kernel.MOMENTUM :].any():
             return pin.integrate(self.robot.model, q, time * velocity)
-        rates = velocity[6:]
         start = np.asarray(q)
 
         def drifting(at: Floats, _: float) -> Floats:
@@ -837,7 +986,7 @@ class SelectiveLaw:
             rate = as_floats("protected_rate", protected_rate)
             if rate.shape != (self._k,) or not np.all(np.isfinite(rate)):
                 raise InputError(
-                    f"protected_rate is {rate.tolist()}; it needs {self._k} finite numbers, one a column of U_c"
+                    f"protected_rate is {shown(rate.tolist())}; it needs {self._k} finite numbers, one a column of U_c"
                 )
             asked[1 : 1 + self._k] = rate
         return asked
@@ -849,8 +998,8 @@ class SelectiveLaw:
         return values
 
     def _checked_out(self, out: Floats) -> Floats:
-        fit = isinstance(out, np.ndarray) and out.dtype == np.float64 and out.shape == (self.size,)
-        if not (fit and out.flags.c_contiguous and out.flags.writeable):
+        fit = type(out) is np.ndarray and out.dtype == np.float64 and out.shape == (self.size,)
+        if not (fit and out.flags.carray):
             raise InputError(f"out must be a writable, contiguous float64 array ({self.size},), law.size long")
         return out
 
@@ -862,13 +1011,13 @@ class SelectiveLaw:
         vectors = self._flat_vectors(target, target_velocity)
         for name, value in zip(("target", "target_velocity"), vectors, strict=True):
             if not np.all(np.isfinite(value)):
-                raise InputError(f"{name} is not finite: {np.asarray(value).tolist()}")
+                raise InputError(f"{name} is not finite: {shown(value.tolist())}")
         self._checked_out(out)
         if status == kernel.NOT_A_TARGET:
             raise InputError(self.layout.strange_target(np.asarray(target)))
         why = {
             kernel.NO_INERTIA: "the whole robot's inertia H_ww is singular",
-            kernel.NOT_UNIT_QUATERNION: "the base quaternion is not of unit length",
+            kernel.OTHER_MASS: f"robot.model does not weigh {self.robot.mass:g} kg: it was changed after it was loaded",
         }.get(status, "its numbers overflow")
         raise InputError(f"no command at this configuration of '{self.robot.name}': {why}")
 
@@ -905,6 +1054,12 @@ def _placements(data: pin.Data, joints: int) -> Floats:
     return np.lib.stride_tricks.as_strided(first, (joints, 12), (width, first.itemsize))
 
 
+def _checked_limits(limits: Limits) -> Limits:
+    from ssm_decouple.control.limits import Limits
+
+    return as_kind("limits", limits, Limits, "give Limits, such as Limits(braking=0.8), or None")
+
+
 def _vector(name: str, value: ArrayLike) -> Floats:
     vector = as_floats(name, value)
     if vector.shape != (3,):
@@ -917,4 +1072,4 @@ def _default_weights(robot: Robot, rate_limits: Floats) -> Floats:
     others = np.delete(rate_limits, wheels)
     if wheels and others.size and np.all(np.isfinite([*rate_limits[wheels], others.max()])):
         weights[wheels] = (others.max() / rate_limits[wheels]) ** 2
-    return weights
+    return fixed_array(weights)

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import limits_kernel as kernel
 from ssm_decouple.control.collision import Clearance
-from ssm_decouple.errors import InputError, as_floats, as_positive
+from ssm_decouple.errors import InputError, as_floats, as_kind, as_positive, shown
 from ssm_decouple.model.robot import Robot, per_joint
 
 Floats = NDArray[np.float64]
@@ -28,6 +28,11 @@ KINDS = {
 TOLERANCES = {"primal_tol": 1e-12, "dual_tol": 1e-12, "iter_limit": 500}
 LEAST = 1e-11  # weight of the rates beside that of what exceeds the acceleration limits
 KEPT = 1e-7  # share of the acceleration limits that is left for rounding there
+# Weights of the change of the rates, as kernel.STEADY, while joints or pairs of bodies are brought back inside their
+# limits: of those that return, and of what the tasks do meanwhile. Beside bounds that leave them hardly any way, the
+# others would be thrown from limit to limit.
+RETURN_STEADY = 0.2
+TASK_STEADY = 0.5
 
 
 @dataclass(frozen=True)
@@ -50,12 +55,21 @@ class Limits:
     clearance: Clearance | None = None
 
     def __post_init__(self) -> None:
-        if not as_positive("braking", self.braking) < 1.0:
+        object.__setattr__(self, "braking", as_positive("braking", self.braking))
+        if not self.braking < 1.0:
             raise InputError(
                 f"braking is {self.braking}; it is a share below 1 of the acceleration limits, such as 0.8"
             )
         if not (self.clearance is None or isinstance(self.clearance, Clearance)):
-            raise InputError(f"clearance is {self.clearance!r}; give a Clearance, such as Clearance(0.05)")
+            raise InputError(f"clearance is {shown(self.clearance)}; give a Clearance, such as Clearance(0.05)")
+        if self.position is not None:
+            position = as_floats("position limits", self.position)
+            if position.ndim != 2 or np.any(np.isnan(position)):
+                raise InputError(
+                    f"position limits have shape {position.shape}; they need (n, 2) numbers: lower and upper, a row "
+                    "a joint"
+                )
+            object.__setattr__(self, "position", tuple(map(tuple, position.tolist())))
 
     def describe(self, robot: Robot) -> dict[str, Any]:
         """Return them in plain types, for a record."""
@@ -70,7 +84,7 @@ class Limits:
         """
         if self.position is None:
             return robot.position_limits.copy()
-        limits, n = as_floats("position limits", self.position), robot.n_joints
+        limits, n = np.array(self.position, dtype=float), robot.n_joints
         if limits.shape == (2, n) and n != 2:
             limits = limits.T
         if limits.shape != (n, 2):
@@ -242,8 +256,7 @@ class LimitedStep:
         sample_time: float,
     ) -> None:
         n = robot.n_joints
-        if not isinstance(limits, Limits):
-            raise InputError(f"limits is {limits!r}; give Limits, such as Limits(braking=0.8)")
+        as_kind("limits", limits, Limits, "give Limits, such as Limits(braking=0.8)")
         position = limits.positions(robot)
         columns = np.empty((kernel.COLUMNS_SIZE, n))
         columns[kernel.LOWER], columns[kernel.UPPER] = position[:, 0], position[:, 1]
@@ -259,6 +272,7 @@ class LimitedStep:
         self._parameters: Floats = np.array([self.sample_time, limits.braking, distance, 0.0])
         self._steps: Floats = columns[kernel.ACCELERATION] * self.sample_time
         self._buffers: dict[tuple[Any, ...], _Buffers] = {}
+        self._last: _Buffers | None = None
         self._no_rows: tuple[Floats, Floats] = np.empty((0, n)), np.empty(0)
 
     def __call__(
@@ -307,7 +321,7 @@ class LimitedStep:
         buffers = self._buffers.get(key)
         if buffers is None:
             buffers = self._buffers[key] = self._fitting(key)
-        table, told = buffers.table, buffers.told
+        table, told, self._last = buffers.table, buffers.told, buffers
         self._parameters[kernel.NOISE] = noise
         status = kernel.prepare(
             self._columns,
@@ -342,6 +356,16 @@ class LimitedStep:
         near = buffers.sides[kernel.APART].copy() if len(distances) else None
         return LimitedRates(rates, self.robot.joint_names, bounds, near, share, excess, bool(told[kernel.STOPPABLE]))
 
+    def take_out_rounding(self, J_sub: Floats, scale: Floats, found: LimitedRates) -> None:
+        """Bring scale times the rates of the last step into null(J_sub / scale), or to what is wanted of it, in place.
+
+        J_sub (k, n) and its rank are those of the step: its rates, times `scale` (n,), have rounded once more.
+        """
+        assert self._last is not None
+        table, factors, told = self._last.table, self._last.factors, self._last.told
+        residual = (J_sub / scale) @ (scale * found.joint_rates) - found.share * factors[kernel.ATTAINED, : len(J_sub)]
+        kernel.take_out(residual, table, factors, int(told[kernel.RANK]), found.joint_rates)
+
     def _fitting(self, key: tuple[Any, ...]) -> _Buffers:
         """Return buffers for arguments of these shapes, which are checked once."""
         n = self.robot.n_joints
@@ -370,18 +394,19 @@ class LimitedStep:
             joints, pairs = np.flatnonzero(table[kernel.RETURN]), np.flatnonzero(buffers.sides[kernel.APART])
             J = np.vstack([np.eye(n)[joints], G[pairs]])
             v = np.r_[table[kernel.RETURN, joints], buffers.sides[kernel.APART, pairs]]
-            self._step(buffers, J, v, 0.0, 0.0, first - asked, n - first + asked, asked, rates)
+            self._step(buffers, J, v, 0.0, RETURN_STEADY, first - asked, n - first + asked, asked, rates)
             kernel.hold_return(table, buffers.sides, G, rates)
         if asked:
             length = told[kernel.LENGTH]
             direction = table[kernel.FIXED : kernel.FIXED + 1] / length
             # More than is wanted is asked for, and a bound keeps it to that: so no regularisation takes from it.
             self._step(buffers, direction, np.array([1.01 * length]), 0.0, 0.0, first - 1, 1, asked, rates)
+        steady = TASK_STEADY if told[kernel.RETURNING] else kernel.STEADY
         for number, (J, v, rho) in enumerate(levels):
             if first == n:
                 break
             decided = int(told[kernel.COUNTS + number])
-            self._step(buffers, J, v, rho, kernel.STEADY, first, decided, 0, rates)
+            self._step(buffers, J, v, rho, steady, first, decided, 0, rates)
             first += decided
 
     def _step(

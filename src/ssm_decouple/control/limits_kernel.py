@@ -65,7 +65,8 @@ STARTS = 1
 DIAGONAL = 2
 ORDER = 3
 ATTAINED = 4  # what of `wanted` J_sub has the rank for
-FACTORS_SIZE = 5
+RESIDUAL = 5  # scratch, one a row of J_sub
+FACTORS_SIZE = 6
 
 # Where the results stand in `told`; how many coordinates each level takes follows.
 RANK = 0
@@ -262,22 +263,30 @@ def factor_protected_rows(rows: Floats, factors: Floats, k: int, noise: float) -
 
 
 @compiled
-def take_out_leak(J_sub: Floats, table: Floats, factors: Floats, rank: int, share: float, x: Floats) -> None:
-    """Bring x (n,) to J_sub x = share ATTAINED in place, by the smallest change, with the factors of J_sub."""
+def take_out(residual: Floats, table: Floats, factors: Floats, rank: int, x: Floats) -> None:
+    """Take J_sub^+ residual off x (n,) in place, with the factors of J_sub and its rank as the step has found it."""
     n, rows, leak = x.shape[0], table[BASIS + x.shape[0] :], table[SCRATCH]
     fill(leak, 0.0)
     for i in range(rank):
-        row = int(factors[ORDER, i])
-        residual = -share * factors[ATTAINED, row]
-        for j in range(n):
-            residual += J_sub[row, j] * x[j]
+        leak[i] = residual[int(factors[ORDER, i])]
         for s in range(i):
-            residual -= rows[i, s] * leak[s]
-        leak[i] = residual / factors[DIAGONAL, i]
+            leak[i] -= rows[i, s] * leak[s]
+        leak[i] /= factors[DIAGONAL, i]
     for i in range(rank - 1, -1, -1):
         apply_reflection(rows, factors, i, i, leak)
     for j in range(n):
         x[j] -= leak[j]
+
+
+@compiled
+def take_out_leak(J_sub: Floats, table: Floats, factors: Floats, rank: int, share: float, x: Floats) -> None:
+    """Bring x (n,) to J_sub x = share ATTAINED in place, by the smallest change, with the factors of J_sub."""
+    residual = factors[RESIDUAL]
+    for i in range(J_sub.shape[0]):
+        residual[i] = -share * factors[ATTAINED, i]
+        for j in range(x.shape[0]):
+            residual[i] += J_sub[i, j] * x[j]
+    take_out(residual, table, factors, rank, x)
 
 
 @compiled

@@ -13,7 +13,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError
-from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.model.origin import from_base
+from ssm_decouple.momentum.protection import Protection, checked_protection
 
 try:
     from pink.tasks import Task
@@ -36,7 +37,7 @@ class ConservedMomentum(Task):  # type: ignore[misc]
     def compute_jacobian(self, configuration: Any) -> Floats:
         """Return the centroidal map A_g (6, nv): [linear; angular] about the centre of mass, inertial axes."""
         model = configuration.model
-        return np.array(pin.computeCentroidalMap(model, model.createData(), configuration.q))
+        return np.array(pin.computeCentroidalMap(model, model.createData(), from_base(configuration.q)))
 
     def __repr__(self) -> str:
         return "ConservedMomentum()"
@@ -53,7 +54,7 @@ class ProtectedRate(Task):  # type: ignore[misc]
     """
 
     def __init__(self, protection: Protection) -> None:
-        if protection.k == 0:
+        if checked_protection(protection).k == 0:
             raise InputError("the protection has no direction, which is no constraint: leave it out")
         super().__init__(cost=np.ones(protection.k))
         self.protection = protection

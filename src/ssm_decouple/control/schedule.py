@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -10,11 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.control.law import LostDirection, SelectiveLaw
+from ssm_decouple.control.law import FULL, LostDirection, SelectiveLaw
 from ssm_decouple.control.task import RateTask
-from ssm_decouple.errors import InputError, as_floats, as_positive
+from ssm_decouple.errors import InputError, as_floats, as_items, as_kind, as_number, as_positive, is_function, shown
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.settled import Settled, fixed, fixed_array
 
 Floats = NDArray[np.float64]
 Progress = Callable[[float, Floats], float]
@@ -26,11 +28,13 @@ _OF_THE_BRIDGE: tuple[int | slice, ...] = (  # what a hand-over's results are, o
     kernel.PLAN_CHANGE,
     kernel.EXCESS,
     kernel.LIMITED,
+    kernel.LOST,
+    kernel.LOST_TO,
 )
 SHARED = 1e-12  # how far from 1 the cosine between two subspaces may be for a direction to count as in both
 
 
-class Schedule:
+class Schedule(Settled):
     """Protections one after the other, each handed over to the next smoothly.
 
     By time, each but the first begins to enter at its own time and has done so a hand-over later:
@@ -70,11 +74,9 @@ class Schedule:
             raise InputError("a schedule needs either hand_over, s, for protections with times, or progress(time, q)")
         self._starts: Floats = np.zeros(0)
         self._hand_over, self._progress = 1.0, progress
-        if progress is not None and not callable(progress):
-            raise InputError(f"progress is {progress!r}; it must be a function of time, s, and configuration")
-        if isinstance(protections, str) or not isinstance(protections, Sequence):
-            raise InputError(f"protections is {protections!r}; a schedule needs a list of two or more")
-        given = list(protections)
+        if progress is not None and not is_function(progress):
+            raise InputError(f"progress is {shown(progress)}; it must be a function of time, s, and configuration")
+        given = as_items("protections", protections, "a schedule needs a list of two or more")
         if hand_over is not None:
             self._hand_over = as_positive("hand_over", hand_over)
             given = self._read_times(given)
@@ -86,21 +88,23 @@ class Schedule:
             raise InputError(f"the protections of a schedule need the same frame, not {', '.join(frames)}")
         self.frame = frames[0] if frames else "base"
         found: list[Floats] = []
-        self.rows = tuple([_place(found, column) for column in p.U_twist.T] for p in self.protections)
-        self.U_twist: Floats = np.array(found).reshape(-1, 6).T
+        self.rows = tuple(fixed([_place(found, column) for column in p.U_twist.T]) for p in self.protections)
+        self.U_twist: Floats = fixed_array(np.array(found).reshape(-1, 6).T)
         self.k: int = len(found)
 
     def _read_times(self, given: list[Any]) -> list[Any]:
-        if not all(isinstance(pair, Sequence) and not isinstance(pair, str) and len(pair) == 2 for pair in given):
+        if not all(isinstance(pair, list | tuple) and len(pair) == 2 for pair in given):
             raise InputError("a schedule by time is a list of pairs (time in s, protection)")
         self._starts = as_floats("schedule times", [pair[0] for pair in given])
         gaps = np.diff(self._starts)
         if not (np.all(np.isfinite(self._starts)) and self._starts.size and self._starts[0] == 0.0):
-            raise InputError(f"schedule times are {self._starts.tolist()}; the first protection has to start at 0 s")
+            raise InputError(
+                f"schedule times are {shown(self._starts.tolist())}; the first protection has to start at 0 s"
+            )
         if not (np.all(gaps[:1] > 0) and np.all(gaps[1:] >= self._hand_over)):
             raise InputError(
-                f"schedule times {self._starts.tolist()} leave no room for hand-overs of {self._hand_over:g} s; let "
-                "them rise, each later than the hand-over before it ends"
+                f"schedule times {shown(self._starts.tolist())} leave no room for hand-overs of {self._hand_over:g} s; "
+                "let them rise, each later than the hand-over before it ends"
             )
         return [pair[1] for pair in given]
 
@@ -114,8 +118,7 @@ class Schedule:
             InputError: `progress` is not in [0, protections - 1].
         """
         last = len(self.protections) - 1
-        if not np.isfinite(time):
-            raise InputError(f"time is {time}; a schedule needs a finite one, s")
+        time = as_number("time", time, "a schedule needs a finite one, s")
         if self._progress is None:
             entering = int(np.searchsorted(self._starts[1:], time, side="right"))  # how many have begun to enter
             way = (time - self._starts[entering]) / self._hand_over if entering else 1.0
@@ -128,6 +131,20 @@ class Schedule:
         number = min(int(place), last)
         x = place - number
         return number, x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
+
+    def seen_from(self, origin: Floats) -> Schedule:
+        """Return the schedule for configurations whose base position is counted from another origin (3,), m."""
+        if self._progress is None:
+            return self
+        seen, progress = copy.copy(self), self._progress
+
+        def true_progress(time: float, q: Floats) -> float:
+            there = np.array(q, dtype=float)
+            there[:3] += origin
+            return progress(time, there)
+
+        seen._progress = true_progress
+        return seen
 
     def shared(self, number: int) -> Protection:
         """Return what the protection of that number and the next have in common: it stays protected in between."""
@@ -198,8 +215,7 @@ class ScheduledLaw(SelectiveLaw):
     """
 
     def __init__(self, robot: Robot, schedule: Schedule, **settings: Any) -> None:
-        if not isinstance(schedule, Schedule):
-            raise InputError(f"schedule is {schedule!r}; give a Schedule, or use SelectiveLaw for one Protection")
+        as_kind("schedule", schedule, Schedule, "give a Schedule, or use SelectiveLaw for one Protection")
         self.phases: tuple[SelectiveLaw, ...] = ()
         super().__init__(robot, schedule.protections[0], **settings)
         self.schedule = schedule
@@ -227,6 +243,15 @@ class ScheduledLaw(SelectiveLaw):
         told = [schedule.shares(*schedule.at(t, q)) for t, q in zip(time.tolist(), configurations, strict=True)]
         return np.array(told).reshape(len(time), schedule.k)
 
+    def seen_from(self, origin: Floats) -> ScheduledLaw:
+        """Return the law for configurations whose base position is counted from another origin (3,), m.
+
+        Its schedule goes on to look at the true ones; the scratch memory of both laws is one.
+        """
+        seen = copy.copy(self)
+        object.__setattr__(seen, "schedule", self.schedule.seen_from(origin))  # a copy that is being made
+        return seen
+
     def lost_direction(self, q: ArrayLike) -> LostDirection:
         """Refuse: it is a matter of one protection.
 
@@ -249,22 +274,23 @@ class ScheduledLaw(SelectiveLaw):
         out: Floats,
         previous_rates: ArrayLike | None = None,
         protected_rate: ArrayLike | None = None,
-        pace: float = 1.0,
+        pace: float = FULL,
         time: float = 0.0,
     ) -> None:
         """Compute a command into an array, as `SelectiveLaw.evaluate` does; the call does the same.
 
-        `protected_rate` has a number for each of the K rows. During a hand-over the command's own is that of the rows
-        which both protections have.
+        `protected_rate` has a number for each of the K rows. The command's own has the rows that are protected then,
+        and during a hand-over those of what both protections have; as of one protection it is the mean over the hold
+        where the law has hold nodes. The record of a motion has all K.
 
         Raises:
             InputError: as for `SelectiveLaw`.
         """
         wanted = self._rows_of_each(protected_rate)
-        number, share = self.schedule.at(time, np.asarray(q))
+        number, share = self.schedule.at(time, self.robot.checked(q))
         if share == 0.0:
             self.phases[number].evaluate(q, target, target_velocity, out, previous_rates, wanted[number], pace)
-            self.limited, self._k = self.phases[number].limited, self.phases[number].protection.k
+            self._limited, self._k = self.phases[number].limited, self.phases[number].protection.k
             return
         self._checked_out(out)
         for phase, values in ((number, self._first), (number + 1, self._second)):
@@ -278,7 +304,7 @@ class ScheduledLaw(SelectiveLaw):
         for kept in _OF_THE_BRIDGE:
             out[6 + n :][kept] = bridged[6 + n :][kept]
         out[6 + n + kernel.RATE_SCALE] = min(part[6 + n + kernel.RATE_SCALE] for part in (first, second, bridged))
-        self.limited, self._k = bridge.limited, bridge.protection.k
+        self._limited, self._k = bridge.limited, bridge.protection.k
 
     def _rows_of_each(self, protected_rate: ArrayLike | None) -> list[Floats | None]:
         if protected_rate is None:
@@ -286,8 +312,8 @@ class ScheduledLaw(SelectiveLaw):
         rate = as_floats("protected_rate", protected_rate)
         if rate.shape != (self.schedule.k,) or not np.all(np.isfinite(rate)):
             raise InputError(
-                f"protected_rate is {rate.tolist()}; it needs {self.schedule.k} finite numbers, one a direction of the "
-                "schedule"
+                f"protected_rate is {shown(rate.tolist())}; it needs {self.schedule.k} finite numbers, one a direction "
+                "of the schedule"
             )
         return [rate[rows] for rows in self.schedule.rows]
 

@@ -16,8 +16,9 @@ import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.control import kernel
-from ssm_decouple.errors import InputError, as_floats, as_positive
+from ssm_decouple.errors import InputError, as_floats, as_items, as_positive, as_text, as_whole, shown
 from ssm_decouple.model.robot import Robot
+from ssm_decouple.settled import Settled, fixed_array
 
 Floats = NDArray[np.float64]
 
@@ -54,10 +55,15 @@ class Task(ABC):
     takes_target: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
-        for name, value in (("gain", self.gain), ("weight", self.weight)):
-            as_positive(f"{self.word} task: {name}", 1.0 if value is None else value)
-        if isinstance(self.level, bool) or not isinstance(self.level, int) or self.level < 1:
-            raise InputError(f"{self.word} task: level is {self.level!r}; levels are 1 (first), 2, ..")
+        place = f"{self.word} task: "
+        gain = None if self.gain is None else as_positive(place + "gain", self.gain)
+        level = as_whole(place + "level", self.level, 1, "levels are 1 (first), 2, ..")
+        kept: dict[str, Any] = {"gain": gain, "weight": as_positive(place + "weight", self.weight), "level": level}
+        for name in ("frame", "reference"):
+            if hasattr(self, name) and (name == "reference" or getattr(self, name) is not None):
+                kept[name] = as_text(place + name, getattr(self, name), "it is the name of a frame of the robot")
+        for name, value in kept.items():
+            object.__setattr__(self, name, value)
 
     @property
     def word(self) -> str:
@@ -108,6 +114,7 @@ class FrameTask(Task):
     level: int = 1
 
 
+@dataclass(frozen=True)
 class PositionTask(FrameTask):
     """Bring the origin of a frame to a position: target (3,), m, inertial axes; its velocity (3,), m/s.
 
@@ -131,6 +138,7 @@ class PositionTask(FrameTask):
         return 3, 3
 
 
+@dataclass(frozen=True)
 class OrientationTask(FrameTask):
     """Turn a frame to an attitude: target a rotation matrix (3, 3), frame to inertial axes, or a pin.SE3's.
 
@@ -161,6 +169,7 @@ class OrientationTask(FrameTask):
         return 9, 3
 
 
+@dataclass(frozen=True)
 class PoseTask(FrameTask):
     """Bring a frame to a pose: target a pin.SE3 or a homogeneous matrix (4, 4), frame to inertial.
 
@@ -306,9 +315,10 @@ class PostureTask(Task):
         super().__post_init__()
         if self.joints is None:
             return
-        joints = (self.joints,) if isinstance(self.joints, str) else tuple(self.joints)
+        named = [self.joints] if isinstance(self.joints, str) else self.joints
+        joints = tuple(as_text("a joint of a posture task", name) for name in as_items("joints", named, _NAMES))
         if not joints or len(set(joints)) < len(joints):
-            raise InputError(f"a posture task needs one or more different joints, not {list(joints)}")
+            raise InputError(f"a posture task needs one or more different joints, not {shown(list(joints))}")
         object.__setattr__(self, "joints", joints)
 
     def pieces(self, robot: Robot) -> list[Piece]:
@@ -375,7 +385,7 @@ class ManipulabilityTask(RateTask):
             raise InputError("a manipulability task serves those of level 1, so its level is 2 or more")
 
 
-class Layout:
+class Layout(Settled):
     """The tasks of a law: how their rows and targets stand in the kernel's arrays, which follow the levels.
 
     Attributes:
@@ -430,9 +440,9 @@ class Layout:
         self.level_rows = tuple(slice(end - count, end) for end, count in zip(ends, counts, strict=True))
         self.row_names, self.size = tuple(names), len(names)
         self.row_levels = tuple(level for level, count in enumerate(counts, 1) for _ in range(count))
-        self.table: Floats = np.array(lines, dtype=float)
+        self.table: Floats = fixed_array(np.array(lines, dtype=float))
         self.slowest_gain = float(self.table[self.table[:, kernel.LEVEL] == 0, kernel.GAIN].min())
-        self.moves: Floats = np.array(moves)
+        self.moves: Floats = fixed_array(np.array(moves))
         self.target_sizes: tuple[int, int] = (place[0], place[1])
         self.plain = len(self.tasks) == 1 and isinstance(self.tasks[0], PositionTask)
         self.usual = self.plain and self.tool_position is not None
@@ -470,8 +480,9 @@ class Layout:
         words = [task.word for task in self.tasks if task.takes_target]
         if len(words) == 1:
             values = [values]
-        elif not isinstance(values, Sequence | np.ndarray) or len(values) != len(words):
-            found = len(values) if isinstance(values, Sequence | np.ndarray) else "no sequence"
+        several = isinstance(values, Sequence) or (isinstance(values, np.ndarray) and values.ndim > 0)
+        if not several or len(values) != len(words):
+            found = len(values) if several else "no sequence"
             raise InputError(f"{name}: {found}; give {len(words)}, one a task, in their order: {', '.join(words)}")
         left = iter(values)
         return [next(left) if task.takes_target else None for task in self.tasks]
@@ -487,6 +498,15 @@ class Layout:
                 flat[start] = 1.0
         return flat
 
+    def targets_from(self, origin: Floats, targets: Floats) -> Floats:
+        """Return flat targets whose positions in inertial axes are counted from another origin (3,), m."""
+        moved = targets.copy()
+        for line in self.table:
+            if line[kernel.KIND] == kernel.POINTS and line[kernel.REFERENCE] < 0.0:
+                start, stride = int(line[kernel.TARGET]), int(line[kernel.STRIDE])
+                moved[start : start + 2 * stride + 1 : stride] -= origin
+        return moved
+
     def strange_target(self, targets: Floats) -> str:
         """Say which of flat targets is none: it is no rotation, or no direction."""
         for line in self.table:
@@ -500,7 +520,13 @@ class Layout:
                 gap = np.abs(part @ part.T - np.eye(3)).max()
                 if gap > 1e-7 or np.linalg.det(part) < 0:
                     return f"a target is no rotation: its matrix {part.tolist()} needs right-handed orthonormal columns"
-        return "a target is no rotation or has no direction"
+        return (
+            "a target is no rotation seen from this configuration: the length of the quaternion q[3:7] is off by more "
+            "than a rotation task bears, 1e-7; use pinocchio.normalize(model, q)"
+        )
+
+
+_NAMES = "give a list of joint names, or None for all joints"
 
 
 def _line(piece: Piece, level: int, gain: float, weight: float, place: Sequence[int]) -> list[float]:
@@ -519,7 +545,7 @@ def _flat_pose(target: Any) -> Floats:
     """Return a homogeneous matrix (16,) by rows."""
     if isinstance(target, pin.SE3):
         return target.homogeneous.ravel()
-    right = isinstance(target, np.ndarray) and target.dtype == np.float64
+    right = type(target) is np.ndarray and target.dtype == np.float64
     matrix = target if right else as_floats("a pose target", target)
     if matrix.shape != (4, 4) or matrix[3].tolist() != [0.0, 0.0, 0.0, 1.0]:
         raise InputError(
@@ -544,17 +570,17 @@ def checked_tasks(robot: Robot, tasks: Task | Sequence[Task]) -> tuple[Task, ...
     Raises:
         InputError: there is none, something is no task, or no joint carries the frame that one is to move.
     """
-    several = isinstance(tasks, Sequence) and not isinstance(tasks, str)
-    given = (tasks,) if isinstance(tasks, Task) else tuple(tasks) if several else ()
+    mend = "give one or more, such as PositionTask(), or None for the position alone"
+    given = (tasks,) if isinstance(tasks, Task) else tuple(as_items("tasks", tasks, mend))
     if not given:
-        raise InputError(
-            f"tasks is {tasks!r}; give one or more, such as PositionTask(), or None for the position alone"
-        )
+        raise InputError(f"tasks is {shown(tasks)}; {mend}")
     for task in given:
+        if isinstance(task, type) and issubclass(task, Task):
+            raise InputError(f"a task is the class {task.__name__}; make one: {task.__name__}(..)")
         if not isinstance(task, Task):
             raise InputError(
-                f"{task!r} is no task; use PositionTask, OrientationTask, PoseTask, RelativePoseTask, BoresightTask, "
-                "PostureTask or ManipulabilityTask"
+                f"{shown(task)} is no task; use PositionTask, OrientationTask, PoseTask, RelativePoseTask, "
+                "BoresightTask, PostureTask or ManipulabilityTask"
             )
         moving = all(piece.moves.any() for piece in task.pieces(robot))
         if not moving and isinstance(task, RelativePoseTask):
@@ -589,5 +615,5 @@ def _numbers(name: str, value: Any, size: int, unit: str) -> Floats:
 def _direction(name: str, value: ArrayLike) -> Floats:
     direction = as_floats(name, value)
     if direction.shape != (3,) or not (np.all(np.isfinite(direction)) and np.any(direction)):
-        raise InputError(f"{name} is {value!r}; it needs 3 finite numbers that are not all zero")
+        raise InputError(f"{name} is {shown(value)}; it needs 3 finite numbers that are not all zero")
     return direction

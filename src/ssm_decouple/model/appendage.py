@@ -6,17 +6,16 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from numbers import Integral, Real
 from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import InputError, as_floats, as_items, as_text, as_whole, shown
+from ssm_decouple.model.inspection import inspect_urdf
 from ssm_decouple.model.urdf import (
     Body,
     Finding,
-    inspect_urdf,
     parted_urdf,
     refuse_twins,
     remaining_body,
@@ -24,8 +23,11 @@ from ssm_decouple.model.urdf import (
     triple,
     write_body,
 )
+from ssm_decouple.settled import FixedArrays
 
 Floats = NDArray[np.float64]
+
+MOST_SEGMENTS = 500
 
 _HINGE_LIMIT = "1e9"  # rad/s and N m: URDF wants a number, and nothing drives a hinge
 
@@ -34,8 +36,11 @@ _HINGE_LIMIT = "1e9"  # rad/s and N m: URDF wants a number, and nothing drives a
 _THIN = 1e-14
 
 
+_LARGEST = 1e9  # of any number of an appendage, SI: beyond it squares and cubes leave floating point
+
+
 @dataclass(frozen=True)
-class Appendage:
+class Appendage(FixedArrays):
     """A solar wing or another flat plate that bends out of its plane.
 
     The plate has uniform area density and no thickness. It is cut across its span into equal segments, each a rigid
@@ -78,8 +83,7 @@ class Appendage:
     turn: float = 0.0
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name.strip():
-            raise InputError(f"an appendage's name is {self.name!r}; give it a text that is not empty")
+        as_text("an appendage's name", self.name, "give it a text that is not empty")
         for key, unit in {"span": "m", "chord": "m", "mass": "kg", "frequency": "Hz"}.items():
             value = self._number(key)
             if not 0 < value < np.inf:
@@ -87,42 +91,55 @@ class Appendage:
                 raise self._error(key, f"it must be above zero and finite, in {unit}{rigid}")
         if not 0 <= self._number("damping_ratio") < 1:
             raise self._error("damping_ratio", "it must be from 0 to below 1, for example 0.005")
-        if not isinstance(self.segments, Integral) or isinstance(self.segments, bool) or self.segments < 1:
-            raise self._error("segments", "it must be a whole number from 1")
+        segments = as_whole(f"appendage '{self.name}': segments", self.segments)
+        if segments > MOST_SEGMENTS:
+            raise self._error("segments", f"each is a body with a joint: {MOST_SEGMENTS} at most")
         if not np.isfinite(self._number("turn")):
             raise self._error("turn", "it must be a finite angle, rad")
         if abs(self.turn) > 2 * np.pi:
             raise self._error(
                 "turn", f"more than a whole turn; in rad, {self.turn:g} deg are {np.deg2rad(self.turn):.4g}"
             )
-        object.__setattr__(self, "segments", int(self.segments))
+        object.__setattr__(self, "segments", segments)
         object.__setattr__(self, "mount", tuple(map(float, self._vector("mount"))))
         span, normal = self._direction("span_direction"), self._direction("normal")
-        if abs(span @ normal) > 1e-6:
-            off = float(np.rad2deg(np.arcsin(min(abs(span @ normal), 1.0))))
+        along = float(span @ normal)
+        if abs(along) > 1e-6:
+            off = float(np.rad2deg(np.arcsin(min(abs(along), 1.0))))
             raise self._error("normal", f"it must be perpendicular to span_direction, it is {off:.3g} deg off")
         normal -= (span @ normal) * span
         object.__setattr__(self, "span_direction", tuple(map(float, span)))
         object.__setattr__(self, "normal", tuple(map(float, normal / np.linalg.norm(normal))))
 
     def _error(self, key: str, mend: str) -> InputError:
-        return InputError(f"appendage '{self.name}': {key} is {getattr(self, key)!r}; {mend}")
+        return InputError(f"appendage '{self.name}': {key} is {shown(getattr(self, key))}; {mend}")
 
     def _number(self, key: str) -> float:
-        value = getattr(self, key)
-        if not isinstance(value, Real) or isinstance(value, bool):
+        try:
+            value = as_floats(key, getattr(self, key))
+        except InputError:
+            raise self._error(key, "it must be a number") from None
+        if value.shape != ():
             raise self._error(key, "it must be a number")
-        object.__setattr__(self, key, float(value))
-        return float(value)
+        try:
+            number = float(value)
+        except OverflowError:  # a whole number of hundreds of digits
+            number = 2 * _LARGEST
+        if _LARGEST < abs(number) < np.inf:
+            raise self._error(key, f"it must be {_LARGEST:g} at most")
+        object.__setattr__(self, key, number)
+        return number
 
     def _vector(self, key: str) -> Floats:
         try:
-            values = np.asarray(getattr(self, key))
-        except ValueError:  # ragged
+            values = as_floats(key, getattr(self, key))
+        except InputError:
             values = np.empty(0)
-        if values.shape != (3,) or values.dtype.kind not in "iuf" or not np.all(np.isfinite(values)):
+        if values.shape != (3,) or not np.all(np.isfinite(values)):
             raise self._error(key, "it needs 3 finite numbers, base axes")
-        return values.astype(float)
+        if np.abs(values).max() > _LARGEST:
+            raise self._error(key, f"its numbers must be {_LARGEST:g} at most")
+        return values
 
     def _direction(self, key: str) -> Floats:
         values = self._vector(key)
@@ -233,8 +250,17 @@ class Appendage:
 
         Returns:
             (...), m, for any size of angles.
+
+        Raises:
+            InputError: a wrong length, or not finite.
         """
-        angles = np.cumsum(np.asarray(hinge_angles, dtype=float), axis=-1)
+        given = as_floats("hinge angles", hinge_angles)
+        if not given.ndim or given.shape[-1] != self.segments or not np.all(np.isfinite(given)):
+            raise InputError(
+                f"hinge angles of shape {given.shape}; appendage '{self.name}' needs (.., {self.segments}) finite "
+                "numbers, rad, from the root"
+            )
+        angles = np.cumsum(given, axis=-1)
         return np.asarray(self.span / self.segments * np.sin(angles).sum(axis=-1))
 
 
@@ -244,7 +270,7 @@ def _frozen(values: Floats) -> Floats:
 
 
 @dataclass(frozen=True)
-class Modes:
+class Modes(FixedArrays):
     """Clamped bending modes of a robot's appendages.
 
     Mode j, at rest and for small motion, obeys
@@ -272,15 +298,17 @@ class Modes:
         Raises:
             InputError: fewer than one mode, or more than an appendage has segments.
         """
-        if not isinstance(per_appendage, Integral) or per_appendage < 1:
-            raise InputError(f"per_appendage is {per_appendage!r}; it must be a whole number from 1")
+        per_appendage = as_whole("per_appendage", per_appendage)
+        appendages = checked_appendages(appendages)
+        if not appendages:
+            raise InputError("there is no appendage and so no mode; build one with ssm_decouple.Appendage(..)")
         for appendage in appendages:
             if per_appendage > appendage.segments:
                 raise InputError(
                     f"appendage '{appendage.name}' has {appendage.segments} segments and so as many modes, not "
                     f"{per_appendage}; give it more segments"
                 )
-        kept = range(int(per_appendage))
+        kept = range(per_appendage)
         hinges, modes = sum(a.segments for a in appendages), len(kept) * len(appendages)
         shapes, participation, row = np.zeros((hinges, modes)), np.zeros((6, modes)), 0
         for i, appendage in enumerate(appendages):
@@ -290,10 +318,12 @@ class Modes:
             row += appendage.segments
         return cls(
             names=tuple(f"{a.name} {j + 1}" for a in appendages for j in kept),
-            frequencies=np.concatenate([a.frequencies[kept] for a in appendages]),
-            damping_ratios=np.concatenate([a.damping_ratio * a.frequencies[kept] / a.frequency for a in appendages]),
-            participation=participation,
-            shapes=shapes,
+            frequencies=_frozen(np.concatenate([a.frequencies[kept] for a in appendages])),
+            damping_ratios=_frozen(
+                np.concatenate([a.damping_ratio * a.frequencies[kept] / a.frequency for a in appendages])
+            ),
+            participation=_frozen(participation),
+            shapes=_frozen(shapes),
         )
 
 
@@ -305,10 +335,11 @@ def checked_appendages(appendages: Iterable[Appendage]) -> tuple[Appendage, ...]
     """
     if isinstance(appendages, Appendage):
         raise InputError(f"appendages is the one appendage '{appendages.name}'; put it in a list")
-    found: tuple[Any, ...] = tuple(appendages)
+    mend = "build them with ssm_decouple.Appendage(..)"
+    found: tuple[Any, ...] = tuple(as_items("appendages", appendages, mend))
     for appendage in found:
         if not isinstance(appendage, Appendage):
-            raise InputError(f"{appendage!r} is no appendage; build it with ssm_decouple.Appendage(..)")
+            raise InputError(f"{shown(appendage)} is no appendage; build it with ssm_decouple.Appendage(..)")
     refuse_twins("appendages", [appendage.name for appendage in found])
     return found
 

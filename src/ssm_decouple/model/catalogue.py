@@ -5,15 +5,19 @@ from __future__ import annotations
 import dataclasses
 import math
 import tomllib
+import warnings
+from contextlib import suppress
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from ssm_decouple.errors import InputError, ModelError, unknown
+from ssm_decouple.errors import DecoupleWarning, InputError, ModelError, as_path, as_text, shown, unknown
+from ssm_decouple.files import is_file
 from ssm_decouple.model.appendage import Appendage
+from ssm_decouple.model.formats import read_robot
+from ssm_decouple.model.massless import massless_root
 from ssm_decouple.model.robot import Robot
-from ssm_decouple.model.urdf import read_urdf
 
 _PACKAGE = Path(__file__).parents[1]
 # Installed, the models lie inside the package; in a source tree they lie at its top.
@@ -34,7 +38,7 @@ class Description:
 
     Attributes:
         name: Name of the robot.
-        urdf: Path of its URDF.
+        urdf: Path of its URDF or MJCF.
         end_effector: Frame that the tasks move; None as in `load_robot`.
         appendages: What a TOML robot adds to the URDF.
     """
@@ -58,14 +62,19 @@ def find_robot(source: str | Path) -> Path:
 
     Raises:
         ModelError: it is neither.
+        InputError: it is no text and no path.
     """
     catalogue = models()
+    if isinstance(source, str) and source.lstrip("\ufeff \t\r\n").startswith("<"):
+        raise InputError(f"robot is {shown(source)}; that is the text of a URDF: give Robot(text, name='..') that")
+    path = as_path("robot", source, f"give a path, or a name of the catalogue ({', '.join(catalogue)})")
     if str(source) in catalogue:
         return catalogue[str(source)]
-    path = Path(source).expanduser()
-    if path.is_file():
+    if is_file(path):
         return path
-    kind = "is a folder, not a URDF file" if path.is_dir() else "is neither a file nor a robot of the catalogue"
+    kind = "is neither a file nor a robot of the catalogue"
+    with suppress(OSError):
+        kind = "is a folder, not a URDF file" if path.is_dir() else kind
     raise ModelError(f"'{source}' {kind} ({', '.join(catalogue)})")
 
 
@@ -79,11 +88,12 @@ def find_urdf(source: str | Path) -> Path:
 
 
 def load_robot(source: str | Path, end_effector: str | None = None) -> Robot:
-    """Load a robot: a catalogue name such as "ets_vii", or a path to any URDF, or to a TOML file that adds to one.
+    """Load a robot: a catalogue name such as "ets_vii", or a path to a URDF, an MJCF, or a TOML file that adds to one.
 
     Args:
-        source: Catalogue name or path. The URDF's root link becomes the free-floating base. A TOML file, by its suffix,
-            names a URDF and the flexible appendages on its root link: see `Appendage`.
+        source: Catalogue name or path. The URDF's root link becomes the free-floating base. An MJCF file, by its root
+            element, is rewritten as a URDF. A TOML file, by its suffix, names a URDF or MJCF and the flexible
+            appendages on its root link: see `Appendage`.
         end_effector: The link or frame that the tasks move. None takes the TOML file's own, else the link called
             "end_effector", else the only tip of the arm.
 
@@ -91,12 +101,18 @@ def load_robot(source: str | Path, end_effector: str | None = None) -> Robot:
         The robot.
 
     Raises:
-        ModelError: no such robot, not a URDF, impossible to simulate, or no such end-effector; a TOML file with an
-            unknown key (the nearest known one is named), a missing one, or an appendage that makes no sense.
+        ModelError: no such robot, a file of another format (the message says how to convert it), one that is impossible
+            to simulate, or no such end-effector; a TOML file with an unknown key (the nearest known one is named), a
+            missing one, or an appendage that makes no sense.
     """
+    if end_effector is not None:
+        as_text("end_effector", end_effector, "it is the name of a link or frame, or None")
     found = describe(source)
-    text, tool = read_urdf(found.urdf), end_effector or found.end_effector
-    return Robot(text, name=found.name, end_effector=tool, appendages=found.appendages)
+    text, tool = read_robot(found.urdf), end_effector or found.end_effector
+    robot = Robot(text, name=found.name, end_effector=tool, appendages=found.appendages)
+    for finding in massless_root(robot.model):  # an arm that compose puts on a bus is no mistake, one that floats is
+        warnings.warn(f"robot '{robot.name}': {finding}", DecoupleWarning, stacklevel=2)
+    return robot
 
 
 def describe(source: str | Path) -> Description:
@@ -110,7 +126,7 @@ def describe(source: str | Path) -> Description:
         return Description(path.stem, path)
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:  # not UTF-8, a number of thousands of digits, tables without end
         raise ModelError(f"'{path}' is not TOML: {error}") from error
     except OSError as error:
         raise ModelError(f"cannot read '{path}': {error.strerror or error}") from error
@@ -150,8 +166,8 @@ def _appendage(wing: dict[str, Any], count: int) -> Appendage:
         raise ModelError(f"{place}{missing[0]} is missing")
     values = {key: value for key, value in wing.items() if key != "turn_deg"}
     turn = wing.get("turn_deg", 0.0)
-    if not isinstance(turn, int | float) or isinstance(turn, bool):
-        raise ModelError(f"{place}turn_deg is {turn!r}; it must be a number")
+    if not isinstance(turn, int | float) or isinstance(turn, bool) or not abs(turn) <= 360:
+        raise ModelError(f"{place}turn_deg is {turn!r}; it must be a number, of degrees within one turn")
     return Appendage(**values, turn=math.radians(turn))
 
 
@@ -164,15 +180,17 @@ def example_robot(path: str) -> Path:
     Raises:
         ModelError: the package is not installed, or has no such file; the URDFs near it are named.
     """
+    as_path("path", path)
     try:
         distribution = metadata.distribution("example-robot-data")
     except metadata.PackageNotFoundError:
         raise ModelError("example-robot-data is not installed: pip install 'ssm-decouple[robots]'") from None
     robots = Path(str(distribution.locate_file("cmeel.prefix/share/example-robot-data/robots")))
     found = robots / path
-    if not found.is_file():
+    if not (is_file(found) and found.is_relative_to(robots)):
         first = Path(path).parts[0] if Path(path).parts else ""
-        near = sorted((robots / first).rglob("*.urdf")) or sorted(robots.rglob("*.urdf"))
+        near = sorted(robots.rglob("*.urdf"))
+        near = [urdf for urdf in near if urdf.relative_to(robots).parts[0] == first] or near
         names = ", ".join(str(urdf.relative_to(robots)) for urdf in near[:12])
         raise ModelError(f"example-robot-data has no '{path}'; it has {names}{', ..' if near[12:] else ''}")
     return found

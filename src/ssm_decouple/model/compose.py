@@ -10,11 +10,15 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
 
-from ssm_decouple.errors import ModelError, as_floats
+from ssm_decouple.errors import ModelError, as_floats, as_kind, as_text
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.catalogue import describe
+from ssm_decouple.model.formats import read_robot
+from ssm_decouple.model.grammar import inspect_grammar
+from ssm_decouple.model.inspection import inspect_tree, refuse_impossible
+from ssm_decouple.model.plain import make_plain
 from ssm_decouple.model.robot import Robot, rigid_pose
-from ssm_decouple.model.urdf import parse_urdf, read_urdf, root_link, tip_links, triple
+from ssm_decouple.model.urdf import parse_urdf, root_link, tip_links, triple
 
 
 def compose(
@@ -51,13 +55,17 @@ def compose(
             appendages (they belong on the root link of the whole), or the whole is impossible.
         InputError: the mount is not a pose.
     """
+    for word, value in (("mount_link", mount_link), ("end_effector", end_effector), ("name", name)):
+        if value is not None:
+            as_text(word, value)
+    as_kind("prefix", prefix, str, "it is a text such as 'left_'")
     (bus_text, bus_name, _, appendages), (arm_text, arm_name, known_tool, lost) = _parts(bus), _parts(arm)
     if lost:
         raise ModelError(
             f"arm '{arm_name}' has the appendages {', '.join(wing.name for wing in lost)}, which would leave the root "
             "link; give them to the whole with compose(..).with_appendages([..])"
         )
-    whole, part = parse_urdf(bus_text, bus_name), parse_urdf(arm_text, arm_name)
+    whole, part = _plain(bus_text, bus_name), _plain(arm_text, arm_name)
     carrier = mount_link or root_link(whole)
     links = [link.get("name") for link in whole.findall("link")]
     if carrier not in links:
@@ -84,7 +92,15 @@ def _parts(source: str | Path | Robot) -> tuple[str, str, str | None, tuple[Appe
     if isinstance(source, Robot):
         return source.urdf, source.name, source.end_effector, source.appendages
     found = describe(source)
-    return read_urdf(found.urdf), found.name, found.end_effector, found.appendages
+    return read_robot(found.urdf), found.name, found.end_effector, found.appendages
+
+
+def _plain(text: str, name: str) -> ET.Element:
+    """Return a part in plain form: what is merged is what is read of it."""
+    root = parse_urdf(text, name)
+    refuse_impossible(name, [*inspect_tree(root), *inspect_grammar(root)])
+    make_plain(root)
+    return root
 
 
 def _tool(part: ET.Element, arm_name: str, wanted: str | None, known: str | None) -> str:
@@ -104,8 +120,9 @@ def _tool(part: ET.Element, arm_name: str, wanted: str | None, known: str | None
 
 
 def _rename(part: ET.Element, prefix: str) -> None:
+    top = {id(element) for element in part}
     for element in part.iter():
-        named = element.tag in ("link", "joint", "material", "mimic") and (element in part or element.tag != "link")
+        named = element.tag in ("link", "joint", "material", "mimic") and (id(element) in top or element.tag != "link")
         key = {"parent": "link", "child": "link", "mimic": "joint"}.get(element.tag, "name" if named else None)
         if key is not None and element.get(key) is not None:
             element.set(key, prefix + element.get(key, ""))

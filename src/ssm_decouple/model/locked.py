@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pinocchio as pin
 
-from ssm_decouple.errors import InputError, as_number, unknown
+from ssm_decouple.errors import InputError, as_number, shown, unknown
 from ssm_decouple.model.urdf import floats, triple
 
 _OF_A_FIXED_JOINT = ("parent", "child", "origin")
@@ -27,7 +27,7 @@ def locked_urdf(root: ET.Element, positions: Mapping[str, float], known: Sequenc
         InputError: an unknown joint (the nearest known one is named), or a position that is no finite number.
     """
     if not isinstance(positions, Mapping):
-        raise InputError(f"joints to lock are {positions!r}; give a mapping such as {{'joint_2': 0.5}}, rad or m")
+        raise InputError(f"joints to lock are {shown(positions)}; give a mapping such as {{'joint_2': 0.5}}, rad or m")
     whole = copy.deepcopy(root)
     joints = {joint.get("name"): joint for joint in whole.findall("joint")}
     for name, position in positions.items():

@@ -8,11 +8,12 @@ import xml.etree.ElementTree as ET
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_decouple.errors import InputError, ModelError, as_floats, as_positive
+from ssm_decouple.errors import InputError, ModelError, as_floats, as_positive, shown
 from ssm_decouple.model.urdf import Body, write_body
 
 Floats = NDArray[np.float64]
 
+_MOST = 1e100  # kg m2: the squares of larger ones leave the range of numbers
 _THIN = 1e-9  # a flat body is at the edge of the triangle inequality: rounding must not push it over
 
 
@@ -31,7 +32,9 @@ def payload_body(mass: float, centre_of_mass: ArrayLike, inertia: ArrayLike) -> 
     needs = "it must be above zero, in kg: with nothing in its hand leave it out"
     weight, centre = as_positive("payload mass", mass, needs), as_floats("payload centre_of_mass", centre_of_mass)
     if centre.shape != (3,) or not np.all(np.isfinite(centre)):
-        raise InputError(f"payload centre_of_mass is {centre.tolist()}; it needs 3 finite numbers, m, the frame's axes")
+        raise InputError(
+            f"payload centre_of_mass is {shown(centre.tolist())}; it needs 3 finite numbers, m, the frame's axes"
+        )
     return Body(weight, centre, possible_inertia("payload inertia", inertia))
 
 
@@ -43,9 +46,9 @@ def possible_inertia(name: str, inertia: ArrayLike) -> Floats:
         ModelError: no body has it: a principal moment is not positive, or larger than the sum of the others.
     """
     matrix = as_floats(name, inertia)
-    if matrix.shape != (3, 3) or not np.all(np.isfinite(matrix)):
+    if matrix.shape != (3, 3) or not np.all(np.abs(matrix) < _MOST):
         raise InputError(
-            f"{name} is {matrix.tolist()}; it needs (3, 3) finite numbers, kg m2, about the centre of mass"
+            f"{name} is {shown(matrix.tolist())}; it needs (3, 3) finite numbers, kg m2, about the centre of mass"
         )
     if np.abs(matrix - matrix.T).max() > _THIN * np.abs(matrix).max():
         raise InputError(f"{name} is not symmetric: {matrix.tolist()}")

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ssm_decouple.errors import InputError, as_floats, as_seed
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.errors import InputError, as_floats, as_kind, as_seed, shown
+from ssm_decouple.model.robot import Robot, checked_robot, mimics_told
 from ssm_decouple.model.urdf import parse_urdf, root_link
 
 Floats = NDArray[np.float64]
@@ -45,8 +45,9 @@ class Tolerances:
             value = as_floats(f"tolerance of {name}", getattr(self, name))
             if value.shape != () or not (np.isfinite(value) and 0 <= value < largest):
                 raise InputError(
-                    f"tolerance of {name} is {getattr(self, name)}; it must be at least 0 and below {largest:g}"
+                    f"tolerance of {name} is {shown(getattr(self, name))}; it must be at least 0 and below {largest:g}"
                 )
+            object.__setattr__(self, name, float(value))
 
 
 def perturbed(robot: Robot, tolerances: Tolerances, seed: int | np.random.Generator) -> Robot:
@@ -63,8 +64,8 @@ def perturbed(robot: Robot, tolerances: Tolerances, seed: int | np.random.Genera
         ModelError: the result cannot be simulated.
         InputError: no tolerances, or a seed that is no whole number from 0.
     """
-    if not isinstance(tolerances, Tolerances):
-        raise InputError(f"tolerances is {tolerances!r}; give a Tolerances, such as Tolerances(mass=0.05)")
+    checked_robot(robot)
+    as_kind("tolerances", tolerances, Tolerances, "give a Tolerances, such as Tolerances(mass=0.05)")
     rng = seed if isinstance(seed, np.random.Generator) else np.random.default_rng(as_seed("seed", seed))
     root = parse_urdf(robot.urdf, robot.name)
     for inertial in root.findall("link/inertial"):
@@ -76,12 +77,13 @@ def perturbed(robot: Robot, tolerances: Tolerances, seed: int | np.random.Genera
             parent = joint.find("parent")
             if parent is not None and (parent.get("link") == base) is on_base:
                 _shift(joint, tolerance * rng.uniform(-1, 1, 3))
-    return Robot(
-        ET.tostring(root, encoding="unicode"),
-        name=f"{robot.name} (perturbed)",
-        end_effector=robot.end_effector,
-        appendages=robot.appendages,
-    )
+    with mimics_told():
+        return Robot(
+            ET.tostring(root, encoding="unicode"),
+            name=f"{robot.name} (perturbed)",
+            end_effector=robot.end_effector,
+            appendages=robot.appendages,
+        )
 
 
 def _disturb_body(inertial: ET.Element, tolerances: Tolerances, rng: np.random.Generator) -> None:

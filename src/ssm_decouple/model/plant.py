@@ -14,15 +14,16 @@ from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.errors import DecoupleWarning, InputError, as_floats
 from ssm_decouple.model.appendage import Appendage, flexible_urdf
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.model.urdf import parse_urdf
+from ssm_decouple.settled import FixedArrays, fixed_array
 
 Floats = NDArray[np.float64]
 Integers = NDArray[np.intp]
 
 
 @dataclass(frozen=True)
-class Plant:
+class Plant(FixedArrays):
     """A robot whose appendages bend, beside the rigid robot that the control law sees.
 
     Attributes:
@@ -51,7 +52,7 @@ class Plant:
         Raises:
             ModelError: the appendages do not fit the robot, as `Robot` says when it is given them.
         """
-        whole, appendages = robot, robot.appendages
+        whole, appendages = robot, checked_robot(robot).appendages
         if appendages:
             root = flexible_urdf(parse_urdf(robot.urdf, robot.name), appendages)
             with warnings.catch_warnings():
@@ -68,10 +69,10 @@ class Plant:
         return cls(
             robot=whole,
             rigid=robot,
-            driven=np.array([whole.joint_index(name) for name in robot.joint_names], dtype=np.intp),
-            hinges=np.array(hinges, dtype=np.intp),
-            stiffness=stiffness,
-            damping=damping,
+            driven=fixed_array(np.array([whole.joint_index(name) for name in robot.joint_names], dtype=np.intp)),
+            hinges=fixed_array(np.array(hinges, dtype=np.intp)),
+            stiffness=fixed_array(stiffness),
+            damping=fixed_array(damping),
             appendages=appendages,
         )
 
@@ -159,7 +160,7 @@ class Plant:
             return np.empty(0)
         model = self.robot.model
         at = self.robot.configuration() if q is None else self.robot.checked(q)
-        upper = np.triu(pin.crba(model, model.createData(), at))
+        upper = np.triu(pin.crba(model, pin.Data(model), at))
         M = upper + np.triu(upper, 1).T
         places = 6 + self.hinges
         M_bb, M_bh = M[:6, :6], M[:6, places]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +10,10 @@ import numpy as np
 
 from ssm_decouple.errors import DecoupleError
 from ssm_decouple.model.appendage import inspect_remaining_bus, remaining_bus
-from ssm_decouple.model.urdf import Finding, inspect_urdf, parse_urdf, read_urdf, root_link, tip_links
+from ssm_decouple.model.inspection import inspect_urdf
+from ssm_decouple.model.massless import massless_joints, massless_root
+from ssm_decouple.model.plain import said_of
+from ssm_decouple.model.urdf import Finding, parse_urdf, root_link, tip_links
 
 if TYPE_CHECKING:
     from ssm_decouple.model.robot import Robot
@@ -129,7 +132,14 @@ class Report:
 
     @classmethod
     def of_robot(cls, robot: Robot) -> Report:
-        """Report on a robot that loads."""
+        """Report on a robot that loads.
+
+        Raises:
+            InputError: it is no robot.
+        """
+        from ssm_decouple.model.robot import checked_robot
+
+        checked_robot(robot)
         return cls._of_loaded(robot, robot.end_effector)
 
     @classmethod
@@ -140,10 +150,11 @@ class Report:
             ModelError: the file cannot be read, is not XML or not a URDF; a TOML file is no robot.
         """
         from ssm_decouple.model.catalogue import describe
+        from ssm_decouple.model.formats import read_robot
         from ssm_decouple.model.robot import Robot
 
         described = describe(path)
-        text, name = read_urdf(described.urdf), described.name
+        text, name = read_robot(described.urdf), described.name
         root = parse_urdf(text, str(described.urdf))
         findings = inspect_urdf(root)
         if any(finding.level == "impossible" for finding in findings):
@@ -155,7 +166,9 @@ class Report:
             robot = Robot(text, name=name, end_effector=tool, appendages=described.appendages)
         except DecoupleError as error:
             return cls._unusable(name, [*findings, Finding("impossible", "robot", str(error))])
-        return cls._of_loaded(robot, None if ambiguous else robot.end_effector)
+        report = cls._of_loaded(robot, None if ambiguous else robot.end_effector)
+        heard = [Finding("suspicious", "file", f"other readers of URDF say: {line}") for line in said_of(robot.urdf)]
+        return replace(report, findings=(*report.findings, *heard))
 
     @classmethod
     def _unusable(cls, name: str, findings: list[Finding]) -> Report:
@@ -186,7 +199,12 @@ class Report:
             tips=tuple(tip_links(root)),
             frames=tuple(robot.link_names),
             joints=tuple(joints),
-            findings=(*inspect_urdf(root), *inspect_remaining_bus(root, robot.appendages)),
+            findings=(
+                *robot.findings,
+                *massless_root(model),
+                *massless_joints(model, robot._data),
+                *inspect_remaining_bus(root, robot.appendages),
+            ),
             flexible=FlexibleReport.of_robot(robot) if robot.appendages else None,
         )
 
@@ -207,7 +225,8 @@ class Report:
         lines = [f"{self.name}: {'can be used' if self.usable else 'cannot be used'}"]
         if self.usable and self.inertia is not None:
             moments = ", ".join(f"{moment:.5g}" for moment in self.inertia)
-            named = f"has to be named: {', '.join(self.tips)}" if self.tips else "none, no joint moves"
+            tips = ", ".join(self.tips)
+            named = f"has to be chosen with end_effector, one of: {tips}" if tips else "none, no joint moves"
             if self.end_effector is not None and self.joints:
                 named = f"{self.end_effector}, reach {self.reach:.4g} m from the arm's first joint"
             lines += [
@@ -239,6 +258,8 @@ def _quantity(value: float, kind: str, per: str = "") -> str:
 
 
 def _limits(joint: JointReport) -> str:
-    if not np.isfinite(joint.lower):
+    if joint.type == "continuous":
         return "turns without end"
+    if not (np.isfinite(joint.lower) or np.isfinite(joint.upper)):
+        return "no position limits"
     return f"{_quantity(joint.lower, joint.type).split()[0]} to {_quantity(joint.upper, joint.type)}"

@@ -1,12 +1,15 @@
-"""URDF text: read, inspected before anything is built on it, and its shapes."""
+"""URDF text: read, the bodies in it and its shapes."""
 
 from __future__ import annotations
 
+import codecs
 import copy
+import math
+import re
 import xml.etree.ElementTree as ET
-from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +19,6 @@ from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError, ModelError
 
-ONE_DOF_JOINTS = ("revolute", "continuous", "prismatic")
 Level = Literal["note", "suspicious", "impossible"]
 
 
@@ -35,7 +37,7 @@ class Finding:
     message: str
 
     def __str__(self) -> str:
-        return f"{self.where}: {self.message}"
+        return " ".join(f"{self.where}: {self.message}".split())  # on one line, whatever is quoted
 
 
 def read_urdf(path: str | Path) -> str:
@@ -45,23 +47,44 @@ def read_urdf(path: str | Path) -> str:
         ModelError: no such file, or not text.
     """
     try:
-        return Path(path).read_text(encoding="utf-8")
-    except UnicodeDecodeError as error:
-        raise ModelError(f"'{path}' is not a URDF: it is not text") from error
+        content = Path(path).read_bytes()
     except OSError as error:
         raise ModelError(f"cannot read '{path}': {error.strerror or error}") from error
+    declared = re.match(rb"""\s*<\?xml[^>]*encoding\s*=\s*["']([\w.-]+)["']""", content)
+    encoding = "utf-8" if declared is None else declared[1].decode("ascii")
+    for mark, meant in _MARKS.items():
+        if content.startswith(mark):
+            encoding = meant
+    try:
+        text = content.decode(encoding)
+        if encoding == "utf-16" and "<" not in text[:1000]:
+            raise UnicodeError("two bytes that look like a mark")
+    except (UnicodeError, LookupError) as error:
+        raise ModelError(f"'{path}' is not a URDF: it is not text in the encoding {encoding}") from error
+    return text.replace("\r\n", "\n").replace("\r", "\n")
+
+
+_MARKS = {codecs.BOM_UTF8: "utf-8-sig", codecs.BOM_UTF16_LE: "utf-16", codecs.BOM_UTF16_BE: "utf-16"}
 
 
 def parse_urdf(text: str, source: str) -> ET.Element:
     """Return the <robot> element of URDF text.
 
     Raises:
-        ModelError: not XML, not a URDF, or still a xacro.
+        ModelError: not text, not XML, not a URDF, or still a xacro.
     """
+    if not isinstance(text, str):
+        raise ModelError(
+            f"'{source}' is no URDF text but {type(text).__name__}; a file is loaded with load_robot(path)"
+        )
     try:
-        root = ET.fromstring(text)
-    except ET.ParseError as error:
+        root = ET.fromstring(text.removeprefix("\ufeff"))
+    except (ET.ParseError, ValueError) as error:
         raise ModelError(f"'{source}' is not XML: {error}") from error
+    namespace = root.tag.removesuffix("robot")
+    if namespace.startswith("{"):  # one for the whole file, which says nothing
+        for element in root.iter():
+            element.tag = element.tag.removeprefix(namespace)
     if root.tag != "robot":
         raise ModelError(f"'{source}' is XML but not a URDF: its root is <{root.tag}>, expected <robot>")
     if any("xacro" in str(element.tag) for element in root.iter()):
@@ -69,170 +92,58 @@ def parse_urdf(text: str, source: str) -> ET.Element:
     return root
 
 
+_NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
+_NO_NUMBER = re.compile(r"[+-]?(inf|infinity|nan)", re.IGNORECASE)
+
+
+@lru_cache(maxsize=8192)
 def number(text: str) -> float:
-    """Parse a number as C++ does: Python alone would take 1_0 for ten."""
-    if "_" in text:
+    """Parse a number as C++ does, blanks around it aside: Python alone would take 1_0 for ten, and other digits.
+
+    Infinity and "nan" are read, so that who asks can say where they stand.
+
+    Raises:
+        ValueError: it is none, or beyond the largest one.
+    """
+    word = text.strip()
+    if not (_NUMBER.fullmatch(word) or _NO_NUMBER.fullmatch(word)):
         raise ValueError(f"'{text}' is not a number")
-    return float(text)
+    value = float(word)
+    if math.isinf(value) and _NUMBER.fullmatch(word):
+        raise ValueError(f"'{text}' is beyond the largest number")
+    return value
+
+
+@lru_cache(maxsize=8192)  # each is asked for several times, and many are the same
+def numbers(text: str) -> tuple[float, ...]:
+    """Parse the numbers of a URDF attribute such as xyz="0 0 1".
+
+    Raises:
+        ValueError: as `number`.
+    """
+    return tuple(number(word) for word in text.split())
 
 
 def floats(text: str | None, default: tuple[float, ...]) -> NDArray[np.float64]:
     """Parse a URDF attribute such as xyz="0 0 1"."""
-    return np.array(default if text is None else [number(word) for word in text.split()])
+    return np.array(default if text is None else numbers(text))
 
 
-def inspect_urdf(root: ET.Element) -> list[Finding]:
-    """Say everything that is impossible, suspicious or worth a note in a parsed URDF."""
-    try:
-        tree = _inspect_tree(root)
-        return [*tree, *_inspect_places(root), *_inspect_joints(root), *_inspect_inertias(root)]
-    except (ValueError, TypeError, AttributeError) as error:
-        return [Finding("impossible", "file", f"a number or a name is missing or malformed ({error})")]
+def attribute(element: ET.Element, child: str, name: str) -> float:
+    """Return a number that an element's child has as an attribute.
 
-
-def _inspect_places(root: ET.Element) -> list[Finding]:
-    found = [] if root.get("name") else [Finding("impossible", "robot", 'has no name: write <robot name="..">')]
-    for kind in ("joint", "link"):
-        for element in root.findall(kind):
-            for origin in element.findall("origin" if kind == "joint" else "inertial/origin"):
-                for key in ("xyz", "rpy"):
-                    where, given = f"{kind} {element.get('name')}", origin.get(key)
-                    if given is not None and not _three_numbers(given):
-                        place = f'<origin {key}="{given}"> needs 3 finite numbers'
-                        found.append(Finding("impossible", where, place))
-    return found
-
-
-def _three_numbers(text: str) -> bool:
-    try:
-        values = floats(text, ())
-    except ValueError:
-        return False
-    return values.shape == (3,) and bool(np.all(np.isfinite(values)))
-
-
-def _inspect_tree(root: ET.Element) -> list[Finding]:
-    found: list[Finding] = []
-    links = [link.get("name", "") for link in root.findall("link")]
-    if not links:
-        return [Finding("impossible", "robot", "has no <link>")]
-    for kind in ("link", "joint"):
-        names = Counter(element.get("name", "") for element in root.findall(kind))
-        found += [
-            Finding("impossible", f"{kind} {name}", f"this name stands {count} times; rename all but one")
-            for name, count in names.items()
-            if count > 1
-        ]
-    parents: dict[str, str] = {}
-    for joint in root.findall("joint"):
-        where = f"joint {joint.get('name')}"
-        for role in ("parent", "child"):
-            end = joint.find(role)
-            link = None if end is None else end.get("link")
-            if link not in links:
-                found.append(Finding("impossible", where, f"its {role} link '{link}' does not exist"))
-        if found:
-            continue
-        parent, child = (joint.find(role).get("link", "") for role in ("parent", "child"))  # type: ignore[union-attr]
-        if child in parents:
-            found.append(Finding("impossible", where, f"link '{child}' already has a parent; URDF is a tree"))
-        parents[child] = parent
-    if not found:
-        roots = [link for link in links if link not in parents]
-        if len(roots) != 1:
-            found.append(Finding("impossible", "robot", f"needs exactly one root link, has {roots or 'a loop'}"))
-        reached = set(roots)
-        while more := {child for child, parent in parents.items() if parent in reached} - reached:
-            reached |= more
-        if len(roots) == 1 and len(reached) < len(links):
-            lost = ", ".join(link for link in links if link not in reached)
-            found.append(Finding("impossible", "robot", f"links {lost} form a loop, away from the root '{roots[0]}'"))
-    return found
-
-
-def _inspect_joints(root: ET.Element) -> list[Finding]:
-    found = []
-    for joint in root.findall("joint"):
-        where, kind = f"joint {joint.get('name')}", joint.get("type")
-        if kind == "fixed":
-            continue
-        if kind not in ONE_DOF_JOINTS:
-            known = ", ".join(ONE_DOF_JOINTS)
-            found.append(Finding("impossible", where, f"type '{kind}' is not supported; use fixed or one of {known}"))
-            continue
-        if joint.find("mimic") is not None:
-            found.append(Finding("suspicious", where, "<mimic> is not followed: the joint moves on its own"))
-        axis = joint.find("axis")
-        given = "1 0 0" if axis is None else axis.get("xyz", "")
-        if not _three_numbers(given) or not np.any(floats(given, ())):
-            found.append(Finding("impossible", where, f'<axis xyz="{given}"> needs 3 finite numbers, not all zero'))
-        limit = joint.find("limit")
-        if limit is None:
-            if kind == "continuous":
-                found.append(Finding("note", where, "no <limit>: its rate is unlimited unless the law is given one"))
-            else:
-                advice = 'add <limit lower=".." upper=".." effort=".." velocity=".."/> or make it continuous'
-                found.append(Finding("impossible", where, f"a {kind} joint without <limit>; {advice}"))
-            continue
-        lacking = [key for key in ("effort", "velocity") if limit.get(key) is None]
-        if lacking:
-            found.append(Finding("impossible", where, f"its <limit> lacks {' and '.join(lacking)}"))
-            continue
-        if not number(limit.get("velocity", "")) > 0:
-            found.append(Finding("suspicious", where, "no velocity limit above zero: give the law a rate_limit"))
-        lower, upper = number(limit.get("lower", "0")), number(limit.get("upper", "0"))
-        if kind != "continuous" and not upper > lower:
-            found.append(Finding("suspicious", where, f"position limits [{lower:g}, {upper:g}] leave it no room"))
-    return found
-
-
-def _inspect_inertias(root: ET.Element) -> list[Finding]:
-    found, total = [], 0.0
-    moved = {  # but for rotors, whose mass may well be left in the root link
-        joint.find("child").get("link")  # type: ignore[union-attr]
-        for joint in root.findall("joint")
-        if joint.get("type") != "fixed" and joint.find("child") is not None and joint.find("wheel") is None
-    }
-    for link in root.findall("link"):
-        where, inertial = f"link {link.get('name')}", link.find("inertial")
-        if inertial is None:
-            if link.get("name") in moved:
-                found.append(Finding("note", where, "moved by a joint but has no <inertial>"))
-            continue
-        mass = _attribute(inertial, "mass", "value")
-        total += mass
-        if not (np.isfinite(mass) and mass >= 0):
-            found.append(Finding("impossible", where, f"mass {mass:g} kg; it must be zero or more"))
-            continue
-        inertia = _inertia_matrix(inertial)
-        if not np.all(np.isfinite(inertia)):
-            found.append(Finding("impossible", where, "inertia is not finite"))
-            continue
-        small, middle, large = np.linalg.eigvalsh(inertia)
-        if mass == 0:
-            level: Level = "suspicious" if link.get("name") in moved else "note"
-            found.append(Finding(level, where, "zero mass"))
-        if small < -1e-9 * max(large, 1e-300):
-            found.append(Finding("suspicious", where, f"inertia has the negative principal moment {small:.4g} kg m2"))
-        elif small + middle < large * (1 - 1e-6):
-            moments = f"{small:.4g}, {middle:.4g}, {large:.4g}"
-            found.append(
-                Finding("suspicious", where, f"principal moments {moments} kg m2 break the triangle inequality")
-            )
-    if not total > 0:
-        found.append(Finding("impossible", "robot", "no link has mass, so there is no momentum to conserve"))
-    return found
-
-
-def _attribute(element: ET.Element, child: str, name: str) -> float:
+    Raises:
+        ValueError: there is none.
+    """
     found = element.find(child)
     if found is None or found.get(name) is None:
         raise ValueError(f"<{element.tag}> lacks <{child} {name}=..>")
     return number(found.get(name, ""))
 
 
-def _inertia_matrix(inertial: ET.Element) -> NDArray[np.float64]:
-    xx, xy, xz, yy, yz, zz = (_attribute(inertial, "inertia", f"i{ij}") for ij in ("xx", "xy", "xz", "yy", "yz", "zz"))
+def inertia_matrix(inertial: ET.Element) -> NDArray[np.float64]:
+    """Return the inertia (3, 3), kg m2, that an <inertial> gives, in the axes of its <origin>."""
+    xx, xy, xz, yy, yz, zz = (attribute(inertial, "inertia", f"i{ij}") for ij in ("xx", "xy", "xz", "yy", "yz", "zz"))
     return np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
 
 
@@ -284,7 +195,7 @@ def read_body(link: ET.Element) -> Body:
     place = {} if origin is None else origin.attrib
     xyz, rpy = (floats(place.get(key), (0.0, 0.0, 0.0)) for key in ("xyz", "rpy"))
     turned = pin.rpy.rpyToMatrix(*rpy)
-    return Body(_attribute(inertial, "mass", "value"), xyz, turned @ _inertia_matrix(inertial) @ turned.T)
+    return Body(attribute(inertial, "mass", "value"), xyz, turned @ inertia_matrix(inertial) @ turned.T)
 
 
 def write_body(link: ET.Element, body: Body) -> None:
@@ -364,20 +275,34 @@ def root_link(root: ET.Element) -> str:
     return next(link.get("name", "") for link in root.findall("link") if link.get("name") not in children)
 
 
+def joint_end(joint: ET.Element, role: str) -> str:
+    """Return the name of a joint's "parent" or "child" link; "" where it names none."""
+    element = joint.find(role)
+    return "" if element is None else element.get("link", "")
+
+
 def tip_links(root: ET.Element) -> list[str]:
-    """Return the links at the ends of the branches that at least one joint moves, in file order; no wheel's rotor."""
-    joints = {joint.find("child").get("link"): joint for joint in root.findall("joint")}  # type: ignore[union-attr]
-    parents = {joint.find("parent").get("link") for joint in joints.values()}  # type: ignore[union-attr]
+    """Return the links at the ends of the branches that at least one joint moves, in file order.
 
-    def moves(link: str | None) -> bool:
-        while link in joints:
-            if joints[link].get("type") != "fixed" and joints[link].find("wheel") is None:
-                return True
-            link = joints[link].find("parent").get("link")  # type: ignore[union-attr]
-        return False
-
+    Neither a wheel's rotor is one nor a frame that only marks a place: of the latter the link that it is fixed to.
+    """
+    every = root.findall("joint")
+    joints = [joint for joint in every if joint.find("site") is None]
+    marks = {joint_end(joint, "child") for joint in every if joint.find("site") is not None}
+    parents = {joint_end(joint, "parent") for joint in joints}
+    below: dict[str, list[ET.Element]] = {}
+    for joint in joints:
+        below.setdefault(joint_end(joint, "parent"), []).append(joint)
+    moved, waiting = set(), [(root_link(root), False)]
+    while waiting:
+        link, moves = waiting.pop()
+        if moves:
+            moved.add(link)
+        for joint in below.get(link, ()):
+            turns = joint.get("type") != "fixed" and joint.find("wheel") is None
+            waiting.append((joint_end(joint, "child"), moves or turns))
     names = [link.get("name", "") for link in root.findall("link")]
-    return [name for name in names if name not in parents and moves(name)]
+    return [name for name in names if name not in parents and name in moved and name not in marks]
 
 
 @dataclass(frozen=True)
@@ -410,7 +335,10 @@ def visual_shapes(text: str) -> list[Shape]:
     shapes = []
     for link in root.findall("link"):
         for visual in link.findall("visual"):
-            shape = _shape(visual, link.get("name", ""), palette)
+            try:
+                shape = _shape(visual, link.get("name", ""), palette)
+            except ValueError:  # a malformed shape is no reason to refuse a figure
+                continue
             if shape is not None:
                 shapes.append(shape)
     return shapes
@@ -434,7 +362,7 @@ def _shape(visual: ET.Element, link: str, palette: dict[str | None, ET.Element |
         if element is not None:
             size = tuple(float(x) for name in attributes for x in floats(element.get(name), ()))
             if len(size) != {"box": 3, "cylinder": 2, "sphere": 1}[kind]:
-                return None  # a malformed shape is no reason to refuse a figure
+                return None  # as where a number is malformed
             xyz, rpy = (floats(place.get(key), (0.0, 0.0, 0.0)) for key in ("xyz", "rpy"))
             return Shape(visual.get("name", ""), link, kind, size, xyz, rpy, (red, green, blue))
     return None

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_decouple.errors import InputError, as_floats, as_not_negative, as_positive
+from ssm_decouple.errors import InputError, as_floats, as_items, as_not_negative, as_positive, as_text, shown
 from ssm_decouple.model.urdf import Body, floats, parted_urdf, refuse_twins, root_link, triple, write_body
 
 Floats = NDArray[np.float64]
@@ -52,8 +52,7 @@ class Wheel:
     position: ArrayLike = (0.0, 0.0, 0.0)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.name, str) or not self.name.strip():
-            raise InputError(f"a wheel's name is {self.name!r}; give it a text that is not empty")
+        as_text("a wheel's name", self.name, "give it a text that is not empty")
         for key, unit in {"spin_inertia": "kg m2", "max_speed": "rad/s", "max_torque": "N m"}.items():
             self._set(key, as_positive, f"it must be above zero and finite, in {unit}")
         self._set("mass", as_not_negative, "it must be zero or more and finite, in kg")
@@ -65,7 +64,7 @@ class Wheel:
         object.__setattr__(self, "position", tuple(map(float, self._vector("position"))))
 
     def _error(self, key: str, mend: str) -> InputError:
-        return InputError(f"wheel '{self.name}': {key} is {getattr(self, key)!r}; {mend}")
+        return InputError(f"wheel '{self.name}': {key} is {shown(getattr(self, key))}; {mend}")
 
     def _set(self, key: str, checked: Callable[[str, float, str], float], needs: str) -> None:
         object.__setattr__(self, key, checked(f"wheel '{self.name}': {key}", getattr(self, key), needs))
@@ -110,12 +109,13 @@ def wheel_axes(root: ET.Element) -> dict[str, Floats]:
 
 
 def _checked(wheels: Iterable[Wheel]) -> list[Wheel]:
-    found: list[Any] = [wheels] if isinstance(wheels, Wheel) else list(wheels)
+    mend = "build them with ssm_decouple.Wheel(..)"
+    found: list[Any] = [wheels] if isinstance(wheels, Wheel) else as_items("wheels", wheels, mend)
     if not found:
         raise InputError("no wheel is given; build them with ssm_decouple.Wheel(..)")
     for wheel in found:
         if not isinstance(wheel, Wheel):
-            raise InputError(f"{wheel!r} is no wheel; build it with ssm_decouple.Wheel(..)")
+            raise InputError(f"{shown(wheel)} is no wheel; build it with ssm_decouple.Wheel(..)")
     refuse_twins("wheels", [wheel.name for wheel in found])
     return found
 

@@ -9,17 +9,19 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from ssm_decouple.errors import InputError, as_floats, as_text, shown
+from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum import metrics
+from ssm_decouple.settled import FixedArrays
 
 if TYPE_CHECKING:
-    from ssm_decouple.model.robot import Robot
     from ssm_decouple.momentum.protection import Protection
 
 Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
-class Coupling:
+class Coupling(FixedArrays):
     """How joint rates and base motion share momentum at one configuration, at zero total momentum.
 
     Immutable: every array is read-only. The paper is Choi and Kim, AAS 26-723.
@@ -61,7 +63,8 @@ class Coupling:
         Raises:
             InputError: q has the wrong length or is not finite.
         """
-        model, data, configuration = robot.model, robot.model.createData(), robot.checked(q).copy()
+        model = checked_robot(robot).model
+        data, configuration = pin.Data(model), robot.checked(q).copy()
         # No matrix depends on where the base is, but sums about a far origin would round more.
         position = configuration[:3].copy()
         configuration[:3] = 0.0
@@ -95,8 +98,9 @@ class Coupling:
         """Return the rotation (3, 3) from the axes of "base", "inertial" or a frame of the robot to those of `frame`.
 
         Raises:
-            ModelError: the robot has no such frame.
+            InputError: the robot has no such frame.
         """
+        as_text("frame", frame, "it is 'base', 'inertial' or the name of a frame of the robot")
         robot, data = self._placed
         if frame in ("base", "inertial"):
             R = self.base_rotation if frame == "base" else np.eye(3)
@@ -120,8 +124,23 @@ class Coupling:
         )
 
     def base_twist(self, joint_rates: ArrayLike) -> Floats:
-        """Return the base twist (6,) that joint rates (n,) cause: [linear; angular], m/s and rad/s, axes of `frame`."""
-        return self.J_base @ np.asarray(joint_rates, dtype=float)
+        """Return the base twist (6,) that joint rates (n,) cause: [linear; angular], m/s and rad/s, axes of `frame`.
+
+        Raises:
+            InputError: the rates have the wrong length or are not finite.
+        """
+        return self.J_base @ self.checked_rates(joint_rates)
+
+    def checked_rates(self, joint_rates: ArrayLike) -> Floats:
+        """Return joint rates (n,) as an array.
+
+        Raises:
+            InputError: they have the wrong length or are not finite.
+        """
+        rates, n = as_floats("joint_rates", joint_rates), self.J_rc.shape[1]
+        if rates.shape != (n,) or not np.all(np.isfinite(rates)):
+            raise InputError(f"joint_rates is {shown(rates.tolist())}; it needs {n} finite numbers, one a joint")
+        return rates
 
     def manipulability(
         self, protection: Protection | None = None, characteristic_length: float | None = None

@@ -9,10 +9,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ssm_decouple.errors import InputError, as_floats, as_positive
+from ssm_decouple.momentum.protection import Protection, checked_protection
+from ssm_decouple.settled import FixedArrays
 
 if TYPE_CHECKING:
     from ssm_decouple.momentum.coupling import Coupling
-    from ssm_decouple.momentum.protection import Protection
 
 Floats = NDArray[np.float64]
 
@@ -20,7 +21,7 @@ ROUNDING = 64 * np.finfo(float).eps  # a semi-axis below this share of the large
 
 
 @dataclass(frozen=True)
-class Ellipsoid:
+class Ellipsoid(FixedArrays):
     """What a map makes of all joint rates with |q_dot| <= 1: an ellipsoid, by singular value decomposition.
 
     map @ joint_rates = directions * semi_axes. Where joints turn and slide both, |q_dot| mixes rad/s and m/s.
@@ -38,7 +39,12 @@ class Ellipsoid:
     @classmethod
     def of(cls, matrix: Floats, allowed: Floats | None = None) -> Ellipsoid:
         """Return the ellipsoid of a map (r, n), for joint rates in the span of orthonormal columns (n, m)."""
-        basis = np.eye(matrix.shape[1]) if allowed is None else allowed
+        matrix = as_floats("matrix", matrix)
+        if matrix.ndim != 2 or not matrix.size or not np.all(np.isfinite(matrix)):
+            raise InputError(f"matrix has shape {matrix.shape}; it needs rows and columns of finite numbers")
+        basis = np.eye(matrix.shape[1]) if allowed is None else as_floats("allowed", allowed)
+        if basis.ndim != 2 or len(basis) != matrix.shape[1] or not np.all(np.isfinite(basis)):
+            raise InputError(f"allowed has shape {basis.shape}; it needs ({matrix.shape[1]}, m) finite numbers")
         rows = matrix.shape[0]
         directions, values, right = np.linalg.svd(matrix @ basis)
         semi_axes, rates = np.zeros(rows), np.zeros((matrix.shape[1], rows))
@@ -115,10 +121,8 @@ def dynamic_singularity_margin(coupling: Coupling, protection: Protection | None
 
 def protected_share(coupling: Coupling, protection: Protection, joint_rates: ArrayLike) -> float:
     """Compute `Coupling.protected_share`."""
-    rates, n = as_floats("joint_rates", joint_rates), coupling.J_rc.shape[1]
-    if rates.shape != (n,) or not np.all(np.isfinite(rates)):
-        raise InputError(f"joint_rates is {rates.tolist()}; it needs {n} finite numbers, one a joint")
-    U, whole_twist = protection.U_c_in(coupling), len(protection.U_c) == 6
+    rates = coupling.checked_rates(joint_rates)
+    U, whole_twist = checked_protection(protection).U_c_in(coupling), len(protection.U_c) == 6
     inertia = _locked_inertia(coupling) if whole_twist else coupling.H_ww
     motion = (coupling.J_base if whole_twist else coupling.J_rc) @ rates
     total = float(motion @ inertia @ motion)
@@ -129,7 +133,9 @@ def protected_share(coupling: Coupling, protection: Protection, joint_rates: Arr
 
 
 def _allowed(coupling: Coupling, protection: Protection | None) -> Floats:
-    return np.eye(coupling.J_rc.shape[1]) if protection is None else protection.null_space_basis(coupling)
+    if protection is None:
+        return np.eye(coupling.J_rc.shape[1])
+    return checked_protection(protection).null_space_basis(coupling)
 
 
 def _locked_inertia(coupling: Coupling) -> Floats:

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import InputError, as_floats, as_kind, as_text, shown
+from ssm_decouple.settled import Settled, fixed_array
 
 if TYPE_CHECKING:
     from ssm_decouple.momentum.coupling import Coupling
@@ -21,7 +22,7 @@ TOLERANCE = 1e-3  # how far from orthonormal the given axes may be
 DEPENDENT = 1e-9  # singular value, against the largest, below which unit vectors count as dependent
 
 
-class Protection:
+class Protection(Settled):
     """The protected subspace: no base motion along the columns of U_c (paper, eq. 5, and its like for the whole twist).
 
     Columns of three numbers are directions about which the base must not turn, as in the paper. Columns of six act on
@@ -53,15 +54,14 @@ class Protection:
     """
 
     def __init__(self, axes: ArrayLike | str, frame: str = "base") -> None:
-        if not (isinstance(frame, str) and frame):
-            raise InputError(f"frame is 'base', 'inertial' or the name of a frame of the robot, not {frame!r}")
+        if not (isinstance(frame, str) and frame.strip()):
+            raise InputError(f"frame is 'base', 'inertial' or the name of a frame of the robot, not {shown(frame)}")
         given = _named(axes) if isinstance(axes, str) else _columns(axes)
         _refuse_far_from_orthonormal(given)
         self.frame: str = frame
-        self.U_c: Floats = _nearest_orthonormal(given)
+        self.U_c: Floats = fixed_array(_nearest_orthonormal(given))
         self.k: int = self.U_c.shape[1]
-        self.U_twist: Floats = np.vstack([np.zeros((6 - len(self.U_c), self.k)), self.U_c])
-        self.U_c.flags.writeable = self.U_twist.flags.writeable = False
+        self.U_twist: Floats = fixed_array(np.vstack([np.zeros((6 - len(self.U_c), self.k)), self.U_c]))
         self.correction: float = max(map(_angle, given.T, self.U_c.T), default=0.0)
 
     @classmethod
@@ -75,13 +75,10 @@ class Protection:
         Raises:
             InputError: the direction is zero or not finite.
         """
-        try:
-            line = np.array(direction, dtype=float)
-        except (TypeError, ValueError):
-            line = np.empty(0)
+        line = as_floats("boresight", direction)
         length = float(np.linalg.norm(line)) if line.shape == (3,) else 0.0
         if not (np.isfinite(length) and length > 0):
-            raise InputError(f"a boresight needs 3 finite numbers that are not all zero, not {direction!r}")
+            raise InputError(f"a boresight needs 3 finite numbers that are not all zero, not {shown(direction)}")
         across = np.linalg.svd(line[None] / length)[2][1:]
         return cls(across.T, frame)
 
@@ -104,16 +101,18 @@ class Protection:
             InputError: not of this shape, not finite, or nothing but zeros.
         """
         try:
-            given = np.array(participation, dtype=float)
-        except (TypeError, ValueError):
-            raise InputError(f"participation vectors cannot be read as numbers: {participation!r}") from None
+            given = as_floats("participation", participation)
+        except InputError:
+            raise InputError(
+                f"participation vectors cannot be read as numbers: {shown(participation)}; give modes.participation"
+            ) from None
         columns = given[:, None] if given.ndim == 1 else given
         if columns.ndim != 2 or columns.shape[0] != 6:
             raise InputError(
                 f"participation has shape {given.shape}, it needs (6,) or (6, m): a column [linear; angular] a mode"
             )
         if not np.all(np.isfinite(columns)):
-            raise InputError(f"participation is not finite: {given.tolist()}")
+            raise InputError(f"participation is not finite: {shown(given.tolist())}")
         largest = np.abs(columns).max(axis=0, initial=0.0)
         if not np.any(largest > 0):
             raise InputError("participation is all zeros: the base excites no such mode; use 'none' to protect nothing")
@@ -131,14 +130,16 @@ class Protection:
         Raises:
             InputError: as for the class, or the text cannot be read.
         """
-        body, _, frame = text.partition("@")
+        body, at, frame = as_text("protection", text, f"give {_HELP}").strip().partition("@")
+        if (at and not frame.strip()) or "@" in frame:
+            raise InputError(f"cannot read the protection '{text}': behind one '@' stands the name of a frame")
         if any(letter.isalpha() for letter in body.replace("e", "").replace("nan", "").replace("inf", "")):
             return cls(body, frame or "base")
         try:
             rows = [[float(word) for word in row.split(",")] for row in body.split(";")]
             columns = np.array(rows).T
         except ValueError:
-            raise InputError(f"cannot read the protection '{text}': {_HELP}") from None
+            raise InputError(f"cannot read the protection {shown(text)}: {_HELP}") from None
         return cls(columns, frame or "base")
 
     def __repr__(self) -> str:
@@ -159,8 +160,12 @@ class Protection:
         return f"k = {self.k}, {self.frame} axes: {'; '.join(words)}{turned}"
 
     def U_c_in(self, coupling: Coupling) -> Floats:
-        """Return U_c, (3, k) or (6, k) as it was given, in the axes of the coupling's matrices."""
-        if self.frame == coupling.frame:
+        """Return U_c, (3, k) or (6, k) as it was given, in the axes of the coupling's matrices.
+
+        Raises:
+            InputError: it is no coupling.
+        """
+        if self.frame == _checked_coupling(coupling).frame:
             return self.U_c
         R = coupling.rotation_of(self.frame)
         return np.vstack([R @ part for part in np.split(self.U_c, len(self.U_c) // 3)])
@@ -189,6 +194,23 @@ class Protection:
         return coupling.J_rc if len(self.U_c) == 3 else coupling.J_base
 
 
+def _checked_coupling(coupling: Coupling) -> Coupling:
+    from ssm_decouple.momentum.coupling import Coupling
+
+    return as_kind("coupling", coupling, Coupling, "give what robot.coupling(q) returns")
+
+
+def checked_protection(protection: Protection) -> Protection:
+    """Return a protection.
+
+    Raises:
+        InputError: it is none; the message says how one is made.
+    """
+    known = isinstance(protection, str) and all(word in NAMES for word in protection.split("+"))
+    such = protection if known else "yaw"
+    return as_kind("protection", protection, Protection, f"give a Protection: Protection('{such}')")
+
+
 _HELP = (
     f"a name ({', '.join(NAMES)}, or several joined by '+') or numbers, '0.5,0,0.866' or '1,0,0;0,0,1', three a "
     "rotation or six a twist"
@@ -209,9 +231,9 @@ def _named(name: str) -> Floats:
 
 def _columns(axes: ArrayLike) -> Floats:
     try:
-        given = np.array(axes, dtype=float)
-    except (TypeError, ValueError):
-        raise InputError(f"U_c cannot be read as numbers: {axes!r}; give {_HELP}") from None
+        given = as_floats("U_c", axes)
+    except InputError:
+        raise InputError(f"U_c cannot be read as numbers: {shown(axes)}; give {_HELP}") from None
     columns = given[:, None] if given.ndim == 1 else given
     rows, k = columns.shape if columns.ndim == 2 else (0, 0)
     if rows not in (3, 6) or (rows, k) == (3, 6):

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import json
+import os
+import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, BinaryIO, Literal
 
 import numpy as np
 import pinocchio as pin
@@ -15,8 +20,9 @@ from numpy.typing import NDArray
 
 from ssm_decouple.control import kernel
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import FileError
-from ssm_decouple.files import written_whole
+from ssm_decouple.errors import DecoupleWarning, FileError, InputError, as_kind, as_path
+from ssm_decouple.files import is_file, written_whole
+from ssm_decouple.model.origin import from_base
 from ssm_decouple.model.robot import Robot
 
 Floats = NDArray[np.float64]
@@ -40,16 +46,20 @@ class Outcome:
     error: float
 
 
-def judge(time: Floats, error: Floats, tolerance: float, time_constant: float) -> Outcome:
+def judge(
+    time: Floats, error: Floats, tolerance: float, time_constant: float, target_way: Floats | None = None
+) -> Outcome:
     """Say how a motion ended.
 
-    A motion is stalled when, to its end, the error never again shrinks by STALL_PROGRESS within one time constant.
+    A motion is stalled when, to its end, the error never again shrinks by STALL_PROGRESS within one time constant. What
+    a moving target adds to it in that time, at most, has to be shed too: who follows at a distance is not stalled.
 
     Args:
         time: Sample times (m,), s.
         error: Distances to the target (m,), m.
         tolerance: Distance, m, within which the end-effector has arrived.
         time_constant: 1 / k_p, s.
+        target_way: How far the target has moved since the start (m,), in the error's unit; None if it rests.
 
     Returns:
         The outcome.
@@ -59,7 +69,9 @@ def judge(time: Floats, error: Floats, tolerance: float, time_constant: float) -
         return Outcome("converged", float(time[outside[-1] + 1] if outside.size else time[0]), float(error[-1]))
     earlier = np.searchsorted(time, time - time_constant * (1 + 1e-9))
     complete = time - time[0] >= time_constant * (1 - 1e-9)
-    shrinking = ~complete | (error <= (1 - STALL_PROGRESS) * error[np.minimum(earlier, np.arange(time.size))])
+    earlier = np.minimum(earlier, np.arange(time.size))
+    before = error[earlier] if target_way is None else error[earlier] + (target_way - target_way[earlier])
+    shrinking = ~complete | (error <= (1 - STALL_PROGRESS) * before)
     if shrinking[-1]:
         return Outcome("running", float(time[-1]), float(error[-1]))
     first = int(np.flatnonzero(shrinking)[-1]) + 1
@@ -73,7 +85,12 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "joint_rates": (("time", "joint"), "rad/s or m/s", "joint", "commanded joint rates"),
     "base_position": (("time", "axis"), "m", "inertial", "origin of the base frame"),
     "base_quaternion": (("time", "quaternion"), "1", "base to inertial", "base attitude, x y z w"),
-    "base_rpy": (("time", "axis"), "rad", "base to inertial", "roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll)"),
+    "base_rpy": (
+        ("time", "axis"),
+        "rad",
+        "base to inertial",
+        "roll, pitch, yaw: R = Rz(yaw) Ry(pitch) Rx(roll), without jumps at +-pi",
+    ),
     "base_linear_velocity": (("time", "axis"), "m/s", "base", "velocity of the base origin"),
     "base_angular_velocity": (("time", "axis"), "rad/s", "base", "angular velocity of the base"),
     "base_twist_integral": (("time", "twist"), "m, rad", "base", "integral of the base twist from the start"),
@@ -81,7 +98,7 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
         ("time", "protected"),
         "rad/s, or m/s and rad/s",
         "U_c",
-        "U_c^T (base twist) as the law sees it, at the sample or as mean over the hold; in a dynamic motion the truth",
+        "U_c^T (base twist)",
     ),
     "protected_angle": (
         ("time", "protected"),
@@ -92,11 +109,16 @@ _VARIABLES: dict[str, tuple[tuple[str, ...], str, str, str]] = {
     "end_effector_position": (("time", "axis"), "m", "inertial", "end-effector"),
     "target_position": (("time", "axis"), "m", "inertial", "where the end-effector should be"),
     "end_effector_error": (("time",), "m", "", "distance from the end-effector to the target"),
-    "smallest_singular_value": (("time",), "m", "", "smallest singular value of J_gt N_sub"),
+    "smallest_singular_value": (
+        ("time",),
+        "m",
+        "",
+        "smallest singular value of J_gt N_sub, or of the rows of level 1, in joint weights, as the law sees it",
+    ),
     "rate_scale": (("time",), "1", "", "factor that brought the joint rates inside their limits"),
     "rate_blend": (("time",), "1", "", "share of the wanted change of rates that acceleration limits allowed"),
     "plan_change": (("time",), "1", "", "relative change in the last pass of planning for the hold; settled at 1e-13"),
-    "damping": (("time",), "m2", "", "regularising scalar rho, 0 away from singularities"),
+    "damping": (("time",), "m2", "", "regularising scalar rho of level 1, 0 away from singularities"),
     "linear_momentum": (("time", "axis"), "kg m/s", "inertial", "audit: linear momentum of (q, v)"),
     "angular_momentum": (("time", "axis"), "kg m2/s", "inertial", "audit: angular momentum about the centre of mass"),
     "centre_of_mass": (
@@ -143,48 +165,13 @@ def rotations_to(robot: Robot | None, frame: str, configurations: Floats) -> Flo
     if frame == "inertial":
         return Rotation.from_quat(np.ascontiguousarray(configurations[:, 3:7])).as_matrix()
     assert robot is not None
-    held, data = robot.model.frames[robot.frame_id(frame)], robot.model.createData()
+    held, data = robot.model.frames[robot.frame_id(frame)], pin.Data(robot.model)
     turned = np.empty((len(configurations), 3, 3))
     for i, q in enumerate(configurations):
         pin.forwardKinematics(robot.model, data, q)
         axes = data.oMi[held.parentJoint].rotation @ held.placement.rotation
         turned[i] = axes.T @ data.oMi[1].rotation
     return turned
-
-
-def protected_integral(
-    U_twist: Floats, frame: str, twists: Floats, configurations: Floats, robot: Robot | None = None
-) -> Floats:
-    """Return how far the base has moved along directions of its twist since the start (m, k), m and rad.
-
-    Along directions fixed in base axes this is the integral of the twist's components. Along directions fixed in
-    inertial axes the linear part is the displacement of the base origin, and for the angular part the rotations from
-    sample to sample are summed, which is its integral to second order in the time between samples. So is the integral
-    along directions fixed in another frame.
-
-    Args:
-        U_twist: Directions of the base twist, columns (6, k).
-        frame: "base", "inertial" or a frame of the robot.
-        twists: Integral of the base twist, base axes (m, 6), m and rad.
-        configurations: Configurations (m, nq), of which the base poses are read.
-        robot: The robot, needed where the frame is one of its own.
-    """
-    from scipy.spatial.transform import Rotation
-
-    if frame == "base" or len(twists) == 1:
-        return twists @ U_twist
-    if frame == "inertial":
-        attitude = Rotation.from_quat(np.ascontiguousarray(configurations[:, 3:7]))
-        turns = np.zeros((len(twists), 3))
-        turns[1:] = np.cumsum((attitude[1:] * attitude[:-1].inv()).as_rotvec(), axis=0)
-        return np.hstack([configurations[:, :3] - configurations[0, :3], turns]) @ U_twist
-    turned = rotations_to(robot, frame, configurations)
-    assert turned is not None
-    between = 0.5 * (turned[1:] + turned[:-1])
-    steps = np.diff(twists, axis=0).reshape(-1, 2, 3)
-    moved = np.zeros_like(twists)
-    moved[1:] = np.cumsum(np.einsum("mij,mbj->mbi", between, steps).reshape(-1, 6), axis=0)
-    return moved @ U_twist
 
 
 def twist_along(
@@ -205,6 +192,49 @@ def twist_along(
     return twists @ U_twist
 
 
+def sum_along(U_twist: Floats, frame: str, twists: Floats, configurations: Floats) -> Floats:
+    """Return how far the base has moved along directions of its twist since the start (m, k), m and rad.
+
+    Args:
+        U_twist: Directions of the base twist, columns (6, k).
+        frame: "base", "inertial" or a frame of the robot: the axes in which they are fixed.
+        twists: Integral of the base twist in these axes (m, 6), m and rad.
+        configurations: Configurations (m, nq). In inertial axes the base positions in them are that integral.
+    """
+    if frame == "inertial":
+        twists = np.hstack([configurations[:, :3] - configurations[0, :3], twists[:, 3:]])
+    return twists @ U_twist
+
+
+def _protected_rates(law: SelectiveLaw, configurations: Floats, values: Floats, scheduled: bool) -> Floats:
+    """Return the base twist along the law's directions (m, k), as the law plans: at the sample or over the hold."""
+    n, (U_twist, axes) = law.robot.n_joints, law.directions
+    if not scheduled:
+        return values[:, 6 + n + kernel.PROTECTED_RATE :][:, : U_twist.shape[1]]
+    if law.hold_nodes:  # a command tells them of the rows alone that are protected then
+        means = [law.mean_twist(q, v[6:]) for q, v in zip(configurations, values[:, : 6 + n], strict=True)]
+        return np.array(means).reshape(-1, 6) @ U_twist
+    return twist_along(U_twist, axes, values[:, :6], configurations, law.robot)
+
+
+def _told_of(law: SelectiveLaw) -> dict[str, dict[str, str]]:
+    """Return what the attributes of a variable say of a motion under this law, by name."""
+    held = "mean over the coming hold, as the law plans it" if law.hold_nodes else "at the sample, as commanded"
+    told = {"protected_rate": {"long_name": f"U_c^T (base twist): {held}"}}
+    if not law.layout.usual:
+        told |= {name: {"units": "as the rows of level 1"} for name in ("smallest_singular_value", "damping")}
+    return told
+
+
+def record_bytes(law: SelectiveLaw, dynamic: bool = False) -> int:
+    """Return about how much memory a sample of a motion takes, and what the plant of a dynamic one tells beside it."""
+    nq, n, k = law.robot.model.nq, law.robot.n_joints, law.directions[0].shape[1]
+    numbers = law.size + 3 * nq + 2 * n + 2 * k + 30
+    if dynamic:  # twice, as they come one by one, in arrays of some hundred bytes each
+        numbers += 2 * (nq + 3 * n + 3 * k + 30) + 80
+    return 8 * numbers
+
+
 def build_motion(
     law: SelectiveLaw,
     time: Floats,
@@ -221,7 +251,7 @@ def build_motion(
         time: Sample times (m,), s.
         configurations: Configurations (m, nq).
         values: The law's output arrays (m, law.size).
-        twists: Integral of the base twist, base axes (m, 6), m and rad.
+        twists: Integral of the base twist in base axes and in those of the law's directions (2, m, 6), m and rad.
         targets: Flat targets (m, size): of one position, that position (m, 3), m, inertial axes.
         audited: Momenta (m, 6) and centres of mass (m, 3) for the audit; None is those of what the law commands.
 
@@ -242,18 +272,16 @@ def build_motion(
 
     arrays = {
         "configuration": configurations,
-        "joint_positions": _joint_positions(model, configurations),
+        "joint_positions": joint_positions(model, configurations, np.diff(time)[:, None] * values[:-1, 6 : 6 + n]),
         "joint_rates": values[:, 6 : 6 + n],
         "base_position": configurations[:, :3],
         "base_quaternion": configurations[:, 3:7],
-        "base_rpy": attitude.as_euler("ZYX")[:, ::-1],
+        "base_rpy": np.unwrap(attitude.as_euler("ZYX")[:, ::-1], axis=0),
         "base_linear_velocity": values[:, :3],
         "base_angular_velocity": values[:, 3:6],
-        "protected_rate": results[:, kernel.PROTECTED_RATE : kernel.PROTECTED_RATE + k]
-        if shares is None
-        else twist_along(U_twist, axes, values[:, :6], configurations, robot),
-        "base_twist_integral": twists,
-        "protected_angle": protected_integral(U_twist, axes, twists, configurations, robot),
+        "protected_rate": _protected_rates(law, configurations, values, shares is not None),
+        "base_twist_integral": twists[0],
+        "protected_angle": sum_along(U_twist, axes, twists[1], configurations),
         "end_effector_position": results[:, kernel.POSITION : kernel.POSITION + 3],
         "target_position": nowhere if layout.tool_target is None else targets[:, layout.tool_target],
         "end_effector_error": np.linalg.norm(
@@ -270,9 +298,10 @@ def build_motion(
         "U_c": U_twist,
         "robot_urdf": np.array(robot.urdf, dtype=object),
     }
+    told = _told_of(law)
     variables = {}
     for name, (dimensions, unit, frame, meaning) in _VARIABLES.items():
-        attributes = {"units": unit, "frame": frame, "long_name": meaning}
+        attributes = {"units": unit, "frame": frame, "long_name": meaning} | told.get(name, {})
         variables[name] = xr.Variable(dimensions, arrays[name], attributes, fastpath=True)
     coordinates = {
         "time": ("time", time, {"units": "s"}),
@@ -292,30 +321,43 @@ def build_motion(
         variables["protection_share"] = xr.Variable(("time", "protected"), shares, _SHARE, fastpath=True)
     attributes = _attributes(law)
     if robot.wheel_names:
-        stored, spans = _wheels(law, time, values)
+        stored = wheel_momenta(model, robot.wheel_names, values[:, : 6 + n])
         variables["wheel_momentum"] = xr.Variable(("time", "wheel"), stored, _WHEEL_MOMENTUM, fastpath=True)
         coordinates["wheel"] = list(robot.wheel_names)
-        attributes["saturated_wheels"] = json.dumps(spans)
+        attributes["saturated_wheels"] = json.dumps(_full_wheels(law, time, values))
     return xr.Dataset(variables, coordinates, attributes)
 
 
-def _wheels(law: SelectiveLaw, time: Floats, values: Floats) -> tuple[Floats, dict[str, list[list[float]]]]:
-    """Return the momentum about its axis of each wheel (m, wheels), and from when to when (s) each was at full speed.
+def _full_wheels(law: SelectiveLaw, time: Floats, values: Floats) -> dict[str, list[list[float]]]:
+    """Return from when to when (s) each wheel was commanded its full speed.
 
     A command is held until the next sample, so a wheel leaves saturation at the first sample that slows it down.
     """
-    robot, spans = law.robot, {}
-    stored = np.empty((len(time), len(robot.wheel_names)))
-    for i, name in enumerate(robot.wheel_names):
-        joint = robot.model.joints[robot.model.getJointId(name)]
-        axis, at = np.ravel(joint.createData().S)[3:], robot.joint_index(name)
-        spin_inertia = axis @ robot.model.inertias[joint.id].inertia @ axis
-        speed = values[:, 6 + at]
-        stored[:, i] = spin_inertia * (speed + values[:, 3:6] @ axis)
-        full = np.abs(speed) >= (1.0 - 1e-9) * law.rate_limits[at]
+    spans = {}
+    for name in law.robot.wheel_names:
+        at = law.robot.joint_index(name)
+        full = np.abs(values[:, 6 + at]) >= (1.0 - 1e-9) * law.rate_limits[at]
         if full.any():
             spans[name] = flagged_spans(time, full[:-1] if len(time) > 1 else full)
-    return stored, spans
+    return spans
+
+
+def wheel_momenta(model: pin.Model, names: Sequence[str], velocities: Floats) -> Floats:
+    """Return the momentum about its axis of each wheel (m, wheels), N m s.
+
+    Args:
+        model: Pinocchio's, in which the wheels are joints of the base.
+        names: Of the wheels.
+        velocities: Pinocchio's velocities (m, nv).
+    """
+    stored = np.empty((len(velocities), len(names)))
+    for i, name in enumerate(names):
+        joint = model.joints[model.getJointId(name)]
+        axis = np.ravel(joint.createData().S)[3:]
+        spin_inertia = axis @ model.inertias[joint.id].inertia @ axis
+        in_base = model.jointPlacements[joint.id].rotation @ axis
+        stored[:, i] = spin_inertia * (velocities[:, joint.idx_v] + velocities[:, 3:6] @ in_base)
+    return stored
 
 
 def flagged_spans(time: Floats, flags: NDArray[np.bool_]) -> list[list[float]]:
@@ -339,22 +381,34 @@ def robot_of(motion: xr.Dataset) -> Robot:
 
 def _audit(model: pin.Model, configurations: Floats, velocities: Floats) -> tuple[Floats, Floats]:
     momenta, centres = np.empty((len(configurations), 6)), np.empty((len(configurations), 3))
-    data = model.createData()
+    data = pin.Data(model)
     total, centre = data.hg, data.com[0]
     for i, (q, v) in enumerate(zip(configurations, velocities, strict=True)):
-        pin.computeCentroidalMomentum(model, data, q, v)
+        near = from_base(q)
+        pin.computeCentroidalMomentum(model, data, near, v)
         momenta[i], centres[i] = total.vector, centre
+        if near is not q:
+            centres[i] += q[:3]
     return momenta, centres
 
 
-def _joint_positions(model: pin.Model, configurations: Floats) -> Floats:
+def joint_positions(model: pin.Model, configurations: Floats, moved: Floats) -> Floats:
+    """Return joint positions (m, n); those of continuous joints, which hold cosine and sine, count on.
+
+    Args:
+        model: Pinocchio's.
+        configurations: (m, nq).
+        moved: About how far each joint goes from sample to sample (m - 1, n): a wheel may turn many times.
+    """
     positions = np.empty((configurations.shape[0], model.nv - 6))
     for i, joint in enumerate(model.joints[2:]):
         first = configurations[:, joint.idx_q]
         if joint.nq == 1:
             positions[:, i] = first
-        else:  # a continuous joint holds cosine and sine
-            positions[:, i] = np.unwrap(np.arctan2(configurations[:, joint.idx_q + 1], first))
+        else:
+            angles = np.arctan2(configurations[:, joint.idx_q + 1], first)
+            turns = np.cumsum(np.rint((moved[:, i] - np.diff(angles)) / (2.0 * np.pi)))
+            positions[:, i] = angles + 2.0 * np.pi * np.r_[0.0, turns]
     return positions
 
 
@@ -370,29 +424,148 @@ def _attributes(law: SelectiveLaw) -> dict[str, Any]:
 def save_motion(motion: xr.Dataset, path: str | Path) -> Path:
     """Write a motion to a netCDF file, whole or not at all.
 
+    Its numbers carry HDF5's own checksums (fletcher32), which any reader heeds, and behind the end of the HDF5 file,
+    where readers do not look, stands the SHA-256 of all its bytes, by which `load_motion` sees that it is as written.
+
     Raises:
+        InputError: it is no dataset, or holds what netCDF cannot.
         FileError: the place cannot be written.
+        InputError: it is no motion, or no path.
     """
-    final = Path(path)
+    as_kind("motion", motion, xr.Dataset, "give what simulate(..) or load_motion(..) returns")
+    final = as_path("path", path)
+    content = _netcdf(motion)  # not written to the disk by HDF5, which does not survive that the disk is full
     with written_whole(final) as temporary:
-        motion.to_netcdf(temporary, engine="h5netcdf")
+        temporary.write_bytes(content + _SEAL + hashlib.sha256(content).hexdigest().encode() + b"\n")
     return final
 
 
 def load_motion(path: str | Path) -> xr.Dataset:
     """Read a motion from a netCDF file.
 
+    What `save_motion` has written is verified first. A file without its checksum, which another program or an earlier
+    version has written, is read as HDF5 lets it, and a warning says so.
+
     Raises:
-        FileError: no such file, not netCDF, or not a motion of this package; what is missing is named.
+        FileError: no such file, not netCDF, damaged, or not a motion of this package; what is missing is named.
     """
-    if not Path(path).is_file():
+    path = as_path("path", path)
+    if not is_file(path):
         raise FileError(f"no motion at '{path}': not a file")
     try:
+        verified = _verify(Path(path))
         with xr.open_dataset(path, engine="h5netcdf") as opened:
             motion = opened.load()
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise FileError(f"'{path}' is not a netCDF file: {error}") from error
+    except FileError:
+        raise
+    except Exception as error:  # HDF5 and its readers raise all kinds
+        told = (isinstance(error, OSError) and error.strerror) or str(error)
+        raise FileError(f"'{path}' is not a netCDF file: {told}") from error
+    _refuse_other(motion, path)
+    if not verified:
+        warnings.warn(
+            f"'{path}' has no checksum, so that damage to it may go unseen: save_motion writes one",
+            DecoupleWarning,
+            stacklevel=2,
+        )
+    return motion
+
+
+_SIGNATURE = b"\x89HDF\r\n\x1a\n"
+_AGAIN = "compute the motion again, or take an undamaged copy of the file"
+_SEAL = b"\nssm-decouple sha256 "  # between HDF5's end and the digest
+_DIGEST = 64 + 1  # characters, with the line's end
+_CHUNK = 2**17  # numbers that carry one checksum
+_DEFLATED = 1032  # times smaller than itself is the most that HDF5's usual compression can make anything
+
+
+def _netcdf(motion: xr.Dataset) -> bytes:
+    """Return a motion as the bytes of a netCDF file."""
+    import h5netcdf
+    from xarray.backends import H5NetCDFStore
+
+    if not isinstance(motion, xr.Dataset):
+        raise InputError(f"{type(motion).__name__} is no motion; give what simulate(..) or load_motion(..) returns")
+    written, content = motion.copy(deep=False), io.BytesIO()
+    for variable in written.variables.values():
+        variable.encoding = _encoding(variable)
+    try:
+        with h5netcdf.File(content, "w") as file:
+            written.dump_to_store(H5NetCDFStore(file))
+    except (TypeError, ValueError, KeyError, AttributeError, RuntimeError, OSError) as error:
+        raise InputError(f"the motion holds what netCDF cannot: {error}") from error
+    return content.getvalue()
+
+
+def _encoding(variable: xr.Variable) -> dict[str, Any]:
+    """Say how a variable is written: numbers with checksums, which HDF5 has for chunks alone."""
+    if variable.dtype.kind not in "fiub" or not variable.ndim or not variable.size:
+        return {}
+    rows, *others = variable.shape
+    parts = -(-variable.size // _CHUNK)
+    return {"fletcher32": True, "chunksizes": (-(-rows // parts), *others)}
+
+
+def _verify(path: Path) -> bool:
+    """Say whether a file has a checksum; refuse one whose bytes are not those that were written.
+
+    HDF5's end stands at its beginning: what is behind it is a checksum, whole or damaged.
+    """
+    with path.open("rb") as file:
+        size, head = os.fstat(file.fileno()).st_size, file.read(64)
+        if not head.startswith(_SIGNATURE):
+            raise FileError(f"'{path}' is not a netCDF file: it is {'empty' if not size else 'no HDF5 file'}")
+        whole = max(0, size - len(_SEAL) - _DIGEST)
+        file.seek(whole)
+        seal = file.read()
+        if seal.startswith(_SEAL):
+            if _sha256(file, whole) != seal[len(_SEAL) : -1]:
+                raise FileError(f"'{path}' is damaged: its bytes are not those that were written; {_AGAIN}")
+            return True
+        if _hdf5_end(head) not in (None, size):
+            raise FileError(f"'{path}' is damaged: its end is not where it was written; {_AGAIN}")
+    _refuse_absurd(path, size)
+    return False
+
+
+def _sha256(file: BinaryIO, size: int) -> bytes:
+    """Return the digest, in hexadecimal, of so many bytes from the beginning of a file."""
+    file.seek(0)
+    found = hashlib.sha256()
+    while size > 0 and (part := file.read(min(size, 2**20))):
+        found.update(part)
+        size -= len(part)
+    return found.hexdigest().encode()
+
+
+def _hdf5_end(head: bytes) -> int | None:
+    """Return where HDF5's superblock says that the file ends; None where it is of a kind that is not known here."""
+    version = head[8] if len(head) == 64 else None
+    if version in (0, 1) and head[13] == 8:
+        start = 40 + 4 * version
+    elif version in (2, 3) and head[9] == 8:
+        start = 28
+    else:
+        return None
+    return int.from_bytes(head[start : start + 8], "little")
+
+
+def _refuse_absurd(path: Path, size: int) -> None:
+    """Refuse a file without a checksum that says that it holds more than its bytes can."""
+    import h5py
+
+    with h5py.File(path) as file:
+        claimed: list[int] = []
+        file.visititems(lambda _, item: claimed.append(item.nbytes if isinstance(item, h5py.Dataset) else 0))
+    if sum(claimed) > _DEFLATED * size:
+        held = f"{sum(claimed) / 1e9:.3g} GB in {size / 1e6:.3g} MB"
+        raise FileError(f"'{path}' is damaged: it claims to hold {held}; {_AGAIN}")
+
+
+def _refuse_other(motion: xr.Dataset, path: str | Path) -> None:
+    """Refuse a netCDF file that is no motion."""
     missing = [name for name in _VARIABLES if name not in motion.variables]
+    missing += [f"the attribute {name}" for name in ("robot", "end_effector", "law") if name not in motion.attrs]
     if missing:
         raise FileError(
             f"'{path}' is netCDF but not a motion: it lacks {', '.join(missing[:4])}{', ..' if missing[4:] else ''}"
@@ -400,4 +573,5 @@ def load_motion(path: str | Path) -> xr.Dataset:
     for name, (dimensions, *_) in _VARIABLES.items():
         if motion[name].dims != dimensions:
             raise FileError(f"'{path}' is no motion: {name} has dimensions {motion[name].dims}, expected {dimensions}")
-    return motion
+        if name != "robot_urdf" and motion[name].dtype.kind != "f":
+            raise FileError(f"'{path}' is no motion: {name} is of {motion[name].dtype}, not of numbers")

@@ -55,21 +55,56 @@ PRESCRIBED = 5  # 1.0: the joints follow the commands whatever torque it takes
 LOAD_FROM = 6  # the external wrench acts from this physics step, counted from the call,
 LOAD_TO = 7  # up to before this one
 LOAD = 8  # 6: force and torque on the base, at its origin, base axes
-INERTIAL = 14  # 1.0 if the directions that the servo spares are fixed in inertial axes, 0.0 in base axes
-SETTINGS_SIZE = 15
+PROTECTS = 14  # 1.0: the servo holds the directions, too
+AXES = 15  # the body of the plant in whose axes the directions are fixed, 0.0 for the base; below 0 in inertial axes
+OWN_AXES = 16  # the same body in the controller's model
+FIRST = 17  # the physics steps that one call does: from this one,
+LAST = 18  # up to before this one; a hold may take several calls
+STEPS_PER_PIECE = 19  # how many of them what the model makes of the motion is integrated over at a time
+DIFFERS = 20  # 1.0: the plant moves otherwise than the controller's model, or something acts from outside
+MOMENTUM = 21  # 6: on board, linear and angular about the centre of mass, inertial axes
+SETTINGS_SIZE = 27
+
+# The rows of `drives`, one entry a commanded joint.
+TORQUE = 0  # that acts at last
+LARGEST = 1  # so far
+LIMITED_TIME = 2  # s, so far in which it stood at its limit
+AT_LIMIT = 3  # 1.0 while it does
+DRIVES_SIZE = 4
+
+# The rows of `parts`, one entry a direction: how far the base has moved along it so far.
+TRUTH = 0
+MODEL = 1  # as the controller's model makes it of the joints' true motion
+PLAN = 2  # as the controller's model makes it of the commands, done at once from each sample on
+PARTS_SIZE = 3
 
 # Where the running sums stand in `totals`.
 TWIST = 0  # 6: integral of the base twist, base axes
 WORK = 6  # of the joint drives
 LOAD_WORK = 7  # of the external wrench
 LOSS = 8  # to the dampers
-SATURATED = 9  # time, s, in which a torque stood at its limit
+SATURATED = 9  # time, s, in which the torque of any drive stood at its limit
 IMPULSE = 10  # 6: of the external wrench, inertial axes, about the inertial origin
 TOTALS_SIZE = 16
 
 OK = -1  # what `advance` returns unless it has stopped
 SINGULAR = 1e-20  # square of what is left of a row, against the longest, below which the joints cannot serve it
 DIVERGED = 1e4  # rad/s or m/s: no spacecraft moves so fast
+ENOUGH = 0.02  # of what plain scaling would leave of the wanted accelerations
+AT = 1.0 - 1e-9  # of its limit, from where on a torque stands at it
+# Nodes and weights of Gauss's quadrature on [0, 1]: one node more than any law plans with.
+_ROOTS, _WEIGHTS = np.polynomial.legendre.leggauss(4)
+NODES, WEIGHTS = 0.5 + 0.5 * _ROOTS, 0.5 * _WEIGHTS
+
+# Where vectors stand in the last rows of a scratch matrix of the servo.
+BIAS = 20
+CHANGE = 21
+SOLUTION = 22
+NEEDED = 23  # torques
+BASIS = 24  # accelerations
+ZEROS = 25
+SHARE = 26  # one number
+COPY = 27  # 6 + n rows
 
 
 @compiled
@@ -194,6 +229,19 @@ def equations(parent: Ints, tree: Floats, q: Floats, v: Floats, bodies: Floats, 
 
 
 @compiled
+def place_whole(whole: Floats, M: Floats) -> None:
+    """Fill the base's part of the mass matrix, lower triangle, with the inertia (10,) of all that it carries."""
+    for r in range(6):
+        for c in range(r + 1):
+            M[r, c] = 0.0
+    M[0, 0] = M[1, 1] = M[2, 2] = whole[0]
+    M[3, 1], M[3, 2], M[4, 0] = -whole[3], whole[2], whole[3]
+    M[4, 2], M[5, 0], M[5, 1] = -whole[1], -whole[2], whole[1]
+    M[3, 3], M[4, 3], M[4, 4] = whole[4], whole[5], whole[7]
+    M[5, 3], M[5, 4], M[5, 5] = whole[6], whole[8], whole[9]
+
+
+@compiled
 def gather(parent: Ints, bodies: Floats, M: Floats, bias: Floats) -> None:
     """Fill M and `bias` from the tips to the base: the way back of `equations`."""
     for i in range(bodies.shape[0] - 1, 0, -1):
@@ -217,14 +265,7 @@ def gather(parent: Ints, bodies: Floats, M: Floats, bias: Floats) -> None:
             j = parent[j - 1]
     for c in range(6):
         bias[c] = bodies[0, FORCE + c]
-        for r in range(6):
-            M[r, c] = 0.0
-    whole = bodies[0, WHOLE:]
-    M[0, 0] = M[1, 1] = M[2, 2] = whole[0]
-    M[3, 1], M[3, 2], M[4, 0] = -whole[3], whole[2], whole[3]
-    M[4, 2], M[5, 0], M[5, 1] = -whole[1], -whole[2], whole[1]
-    M[3, 3], M[4, 3], M[4, 4] = whole[4], whole[5], whole[7]
-    M[5, 3], M[5, 4], M[5, 5] = whole[6], whole[8], whole[9]
+    place_whole(bodies[0, WHOLE:], M)
 
 
 @compiled
@@ -393,6 +434,71 @@ def spare_base(M: Floats, bias: Floats, U: Floats, asked: Floats, small: Floats,
 
 
 @compiled
+def torques_for(M: Floats, bias: Floats, accelerations: Floats, small: Floats, torque: Floats) -> None:
+    """Fill `torque` (n,) with what gives the joints these accelerations (n,) while the base floats."""
+    n = torque.shape[0]
+    change, x = small[CHANGE], small[SOLUTION]
+    for i in range(6):
+        x[i] = -bias[i]
+        for j in range(n):
+            x[i] -= M[6 + j, i] * accelerations[j]
+        for j in range(i + 1):
+            small[i, j] = M[i, j]
+    solve_positive(small, 6, x)
+    for i in range(6):
+        change[i] = x[i]
+    for j in range(n):
+        change[6 + j] = accelerations[j]
+    for j in range(n):
+        torque[j] = bias[6 + j] + row_times(M, 6 + j, change[: 6 + n])
+
+
+@compiled
+def free_accelerations(M: Floats, bias: Floats, small: Floats, accelerations: Floats) -> None:
+    """Fill `accelerations` (n,) with those of the joints without torques."""
+    n = accelerations.shape[0]
+    copy, x = small[COPY:], small[SOLUTION]
+    for i in range(6 + n):
+        x[i] = -bias[i]
+        for j in range(i + 1):
+            copy[i, j] = M[i, j]
+    solve_positive(copy, 6 + n, x)
+    for j in range(n):
+        accelerations[j] = x[6 + j]
+
+
+@compiled
+def fitting_share(fixed: Floats, torque: Floats, limits: Floats) -> float:
+    """Return the largest s in [0, 1] for which fixed + s (torque - fixed) keeps the limits, as `fixed` does."""
+    share = 1.0
+    for j in range(torque.shape[0]):
+        if torque[j] > limits[j]:
+            share = min(share, (limits[j] - fixed[j]) / (torque[j] - fixed[j]))
+        elif torque[j] < -limits[j]:
+            share = min(share, (limits[j] + fixed[j]) / (fixed[j] - torque[j]))
+    return max(share, 0.0)
+
+
+@compiled
+def rows_in_base(U: Floats, axes: int, body: Floats, R: Floats, out: Floats) -> None:
+    """Fill `out` (6, k) with directions of the base twist (6, k) in base axes.
+
+    They are given in the axes of a body, whose FRAME says how they stand in base axes, or with `axes` below 0 in
+    inertial axes, which the base's rotation R (9,), by rows, leads to.
+    """
+    for i in range(U.shape[1]):
+        for c in range(6):
+            out[c, i] = U[c, i]
+        for c in range(3):
+            if axes > 0:
+                out[c, i] = body[3 * c] * U[0, i] + body[3 * c + 1] * U[1, i] + body[3 * c + 2] * U[2, i]
+                out[3 + c, i] = body[3 * c] * U[3, i] + body[3 * c + 1] * U[4, i] + body[3 * c + 2] * U[5, i]
+            elif axes < 0:
+                out[c, i] = R[c] * U[0, i] + R[3 + c] * U[1, i] + R[6 + c] * U[2, i]
+                out[3 + c, i] = R[c] * U[3, i] + R[3 + c] * U[4, i] + R[6 + c] * U[5, i]
+
+
+@compiled
 def servo_torque(
     parent: Ints,
     tree: Floats,
@@ -408,51 +514,199 @@ def servo_torque(
     """Fill `torque` (n,) with what gives the joints the accelerations `wanted` (n,) while the base floats.
 
     Computed torque by the controller's own model. With directions U (6, k) of the base twist the accelerations are
-    changed, in place, so that the base accelerates along them as `asked` (k,). Return whether a limit (n,) cut a
-    torque. `work`, as large as `scratch_of` says, is overwritten.
+    changed, in place, so that the base accelerates along them as `asked` (k,). `work`, as large as `scratch_of` says,
+    is overwritten.
+
+    Returns:
+        Whether a limit (n,) has cut the torques; the first number of the row SHARE of the scratch matrix tells which
+        share of the wanted accelerations is left.
     """
     n = wanted.shape[0]
     bodies, M, small = work[: n + 1], work[n + 1 : 2 * n + 7], work[2 * n + 7 :]
-    bias, change, x = small[20], small[21], small[22]
+    bias = small[BIAS]
     equations(parent, tree, q, v, bodies, M, bias)
     if U.shape[1] > 0:
         spare_base(M, bias, U, asked, small, wanted)
-    for i in range(6):
-        x[i] = -bias[i]
-        for j in range(n):
-            x[i] -= M[6 + j, i] * wanted[j]
-        for j in range(i + 1):
-            small[i, j] = M[i, j]
-    solve_positive(small, 6, x)
-    for i in range(6):
-        change[i] = x[i]
-    for j in range(n):
-        change[6 + j] = wanted[j]
-    cut = False
-    for j in range(n):
-        torque[j] = bias[6 + j] + row_times(M, 6 + j, change[: 6 + n])
-        if abs(torque[j]) > limits[j]:
-            torque[j] = limits[j] if torque[j] > 0.0 else -limits[j]
-            cut = True
-    return cut
+    torques_for(M, bias, wanted, small, torque)
+    return keep_limits(M, bias, U, asked, limits, small, torque)
 
 
 @compiled
-def rows_in_base(U: Floats, pose: Floats, inertial: bool, out: Floats) -> None:
-    """Fill `out` (6, k) with directions of the base twist (6, k) in base axes, given in base or inertial axes."""
-    for i in range(U.shape[1]):
+def driven_torque(
+    parent: Ints,
+    tree: Floats,
+    q: Floats,
+    v: Floats,
+    wanted: Floats,
+    braking: Floats,
+    U: Floats,
+    axes: int,
+    R: Floats,
+    limits: Floats,
+    work: Floats,
+    torque: Floats,
+) -> bool:
+    """Do what `servo_torque` does for drives that know of no directions but at their limits.
+
+    There the base is to accelerate along U (6, k), in the axes that `axes` and R tell, as it would under the servo's
+    loop on the rates alone, which asks for the accelerations `braking` (n,): it takes J_sub q_dot to what the command
+    makes of it.
+    """
+    n, k = wanted.shape[0], U.shape[1]
+    bodies, M, small = work[: n + 1], work[n + 1 : 2 * n + 7], work[2 * n + 7 :]
+    bias, zeros, needed = small[BIAS], small[ZEROS][:n], small[NEEDED][:n]
+    equations(parent, tree, q, v, bodies, M, bias)
+    torques_for(M, bias, wanted, small, torque)
+    zeros[:] = 0.0
+    if fitting_share(zeros, torque, limits) == 1.0:
+        return False
+    U_base, asked = np.empty((6, k)), np.empty(k)
+    rows_in_base(U, axes, bodies[max(axes, 0)], R, U_base)
+    torques_for(M, bias, braking, small, needed)
+    for i in range(k):
+        asked[i] = 0.0
         for c in range(6):
-            out[c, i] = U[c, i]
-        if inertial:
-            for c in range(3):
-                out[c, i] = pose[c] * U[0, i] + pose[3 + c] * U[1, i] + pose[6 + c] * U[2, i]
-                out[3 + c, i] = pose[c] * U[3, i] + pose[3 + c] * U[4, i] + pose[6 + c] * U[5, i]
+            asked[i] += U_base[c, i] * small[CHANGE, c]
+    return keep_limits(M, bias, U_base, asked, limits, small, torque)
+
+
+@compiled
+def keep_limits(
+    M: Floats, bias: Floats, U: Floats, asked: Floats, limits: Floats, small: Floats, torque: Floats
+) -> bool:
+    """Bring all torques (n,) inside their limits together where one is above its own, as rates are.
+
+    One joint cut by itself would leave the null space of J_sub; together they come to the commanded rates later. First
+    come the torques that give the base the acceleration `asked` (k,) along U (6, k) with the least change of the
+    joints' free motion; of what the servo wants beside it the share is taken that the limits allow. Where this is next
+    to nothing, plain scaling takes over, so that no drive at its limit can lock the others.
+    """
+    n = torque.shape[0]
+    needed, zeros, shares = small[NEEDED][:n], small[ZEROS][:n], small[SHARE]
+    zeros[:] = 0.0
+    plain = fitting_share(zeros, torque, limits)
+    shares[0] = plain
+    if plain == 1.0:
+        return False
+    if U.shape[1] > 0:
+        basis = small[BASIS][:n]
+        free_accelerations(M, bias, small, basis)
+        spare_base(M, bias, U, asked, small, basis)
+        torques_for(M, bias, basis, small, needed)
+        share = 0.0
+        if fitting_share(zeros, needed, limits) == 1.0:
+            share = fitting_share(needed, torque, limits)
+        trust = min(1.0, share / (ENOUGH * plain))
+        for j in range(n):
+            torque[j] = trust * (needed[j] + share * (torque[j] - needed[j])) + (1.0 - trust) * plain * torque[j]
+        shares[0] = trust * share + (1.0 - trust) * plain
+    else:
+        for j in range(n):
+            torque[j] *= plain
+    for j in range(n):
+        torque[j] = min(max(torque[j], -limits[j]), limits[j])  # rounding
+    return True
+
+
+@compiled
+def base_twist_of(parent: Ints, tree: Floats, q: Floats, rates: Floats, on_board: Floats, work: Floats) -> Floats:
+    """Return the base twist (6,), base axes, that joint rates (n,) cause with a momentum on board (6,), base axes.
+
+    H twist + (momentum of the joints' motion) = momentum about the base origin. The first rows of `work` hold the
+    bodies afterwards.
+    """
+    n = q.shape[0]
+    bodies, small, whole, own, x = work[: n + 1], work[n + 1 :], np.zeros(10), np.zeros(6), on_board.copy()
+    place_bodies(parent, tree, q, bodies)
+    for i in range(n + 1):
+        me = bodies[i]
+        for c in range(6):
+            me[SPEED + c] = 0.0 if i == 0 else bodies[parent[i - 1], SPEED + c] + me[MOTION + c] * rates[i - 1]
+        place_inertia(tree[i], me, me[WHOLE:])
+        momentum_of(me[WHOLE:], me[SPEED:], own)
+        for c in range(6):
+            x[c] -= own[c]
+        for c in range(10):
+            whole[c] += me[WHOLE + c]
+    a, b, c = whole[1] / whole[0], whole[2] / whole[0], whole[3] / whole[0]
+    x[3] += b * on_board[2] - c * on_board[1]
+    x[4] += c * on_board[0] - a * on_board[2]
+    x[5] += a * on_board[1] - b * on_board[0]
+    place_whole(whole, small)
+    solve_positive(small, 6, x)
+    return x
+
+
+@compiled
+def cubic(x: float, way: float, first: float, last: float) -> float:
+    """Return how much of a way is done at a share x in [0, 1] of its time.
+
+    Beside the straight way stands how far it would go at the first rate beyond it, and how far it would fall short of
+    it at the last one.
+    """
+    return x * way + x * (1.0 - x) * ((1.0 - x) * first + x * last)
+
+
+@compiled
+def add_motion_of_path(
+    parent: Ints,
+    tree: Floats,
+    U: Floats,
+    settings: Floats,
+    start: Floats,
+    end: Floats,
+    time: float,
+    R: Floats,
+    turning: Floats,
+    work: Floats,
+    moved: Floats,
+) -> None:
+    """Add how far joints on a cubic path move the base along directions U, by the controller's model, to `moved` (k,).
+
+    Args:
+        parent: Of the controller's model (n,).
+        tree: Of the controller's model (n + 1, TREE_SIZE).
+        U: Directions (6, k), in the axes that OWN_AXES names.
+        settings: (SETTINGS_SIZE,).
+        start: Joint positions and rates at the start (2, n).
+        end: The same at the end (2, n).
+        time: In between.
+        R: Rotation of the base at the start (9,).
+        turning: Its rotation vector from there to the end, and its rates at both ends (3, 3), base axes.
+        work: As large as `scratch_of` says, overwritten.
+        moved: (k,), added to.
+    """
+    n = start.shape[1]
+    q, rates, on_board, part = np.empty(n), np.empty(n), np.empty(6), np.empty(3)
+    now, U_base, axes = np.empty(9), np.empty((6, U.shape[1])), int(settings[OWN_AXES])
+    for node in range(NODES.shape[0]):
+        x = NODES[node]
+        for j in range(n):
+            way = end[0, j] - start[0, j]
+            first, last = start[1, j] * time - way, way - end[1, j] * time
+            q[j] = start[0, j] + cubic(x, way, first, last)
+            rates[j] = way + (1.0 - x) * (1.0 - 3.0 * x) * first + x * (2.0 - 3.0 * x) * last
+            rates[j] /= time
+        for c in range(3):
+            first, last = turning[1, c] * time - turning[0, c], turning[0, c] - turning[2, c] * time
+            part[c] = cubic(x, turning[0, c], first, last)
+        turn(R, part, now)
+        for c in range(3):
+            on_board[c] = on_board[3 + c] = 0.0
+            for r in range(3):
+                on_board[c] += now[3 * r + c] * settings[MOMENTUM + r]
+                on_board[3 + c] += now[3 * r + c] * settings[MOMENTUM + 3 + r]
+        twist = base_twist_of(parent, tree, q, rates, on_board, work)
+        rows_in_base(U, axes, work[max(axes, 0)], now, U_base)
+        for i in range(U.shape[1]):
+            for c in range(6):
+                moved[i] += WEIGHTS[node] * time * U_base[c, i] * twist[c]
 
 
 @compiled
 def scratch_of(n: int) -> Floats:
     """Return room for the equations of a tree of n joints and for solving them."""
-    return np.empty((3 * n + 32, max(BODIES_SIZE, n + 6)))
+    return np.empty((3 * n + COPY + 16, max(BODIES_SIZE, n + 6)))
 
 
 @compiled
@@ -545,6 +799,30 @@ def split(driven: Ints, size: int, prescribed: bool) -> tuple[Ints, Ints]:
     return np.flatnonzero(~is_given), np.flatnonzero(is_given)
 
 
+@compiled
+def start_piece(driven: Ints, q: Floats, v: Floats, first: bool, piece: Floats) -> None:
+    """Remember where a piece of the motion begins, and with `first` where the hold does: rows of `piece` (5, n)."""
+    for j in range(driven.shape[0]):
+        piece[0, j], piece[1, j] = q[driven[j]], v[6 + driven[j]]
+        if first:
+            piece[4, j] = piece[0, j]
+
+
+@compiled
+def end_piece(driven: Ints, q: Floats, v: Floats, piece: Floats) -> None:
+    """Remember where a piece of the motion ends."""
+    for j in range(driven.shape[0]):
+        piece[2, j], piece[3, j] = q[driven[j]], v[6 + driven[j]]
+
+
+@compiled
+def plan_piece(command: Floats, begins: float, ends: float, piece: Floats) -> None:
+    """Replace a piece of the motion by what it is where the command is done at once from the hold's start on."""
+    for j in range(command.shape[0]):
+        piece[0, j], piece[2, j] = piece[4, j] + begins * command[j], piece[4, j] + ends * command[j]
+        piece[1, j] = piece[3, j] = command[j]
+
+
 @compiled  # when first called: who simulates without torques does not wait for it
 def advance(
     parent: Ints,
@@ -558,16 +836,21 @@ def advance(
     settings: Floats,
     command: Floats,
     reference: Floats,
-    torques: Floats,
-    spared_motion: Floats,
+    drives: Floats,
+    parts: Floats,
+    piece: Floats,
     q: Floats,
     v: Floats,
     pose: Floats,
     totals: Floats,
 ) -> int:
-    """Move a plant through one hold of a command, in physics steps of the classical fourth-order Runge-Kutta method.
+    """Move a plant through a hold of a command, or some of it, in physics steps of the classical Runge-Kutta method.
 
-    The attitude is integrated on the rotation group (Munthe-Kaas), joints and velocities as the vectors that they are.
+    It is of fourth order. The attitude is integrated on the rotation group (Munthe-Kaas), joints and velocities as the
+    vectors that they are.
+
+    A servo's reference moves on with the command, and as far as the limits take its accelerations away, with the joint
+    instead, so that its lead does not wind up.
 
     Args:
         parent: For each joint of the plant, the row of `tree` that carries it (N,).
@@ -577,12 +860,14 @@ def advance(
         own_parent: As `parent`, of the controller's model (n,).
         own_tree: As `tree`, of the controller's model (n + 1, TREE_SIZE).
         limits: Torque limits (n,), infinite where there is none.
-        U: Directions of the base twist that the servo spares (6, k), k may be 0.
+        U: Protected directions of the base twist (6, k), k may be 0, in the axes that AXES names.
         settings: (SETTINGS_SIZE,), by the indices above.
         command: Joint rates (n,), held.
         reference: Where the commands have led the joints so far (n,), overwritten.
-        torques: (2, n): the torques that act at last, and the largest ones so far, overwritten.
-        spared_motion: How far the base has moved along U so far (k,), overwritten.
+        drives: (DRIVES_SIZE, n), overwritten.
+        parts: (PARTS_SIZE, k), added to; the servo that protects brings TRUTH back to zero.
+        piece: (5, n): joint positions and rates at both ends of a piece of the motion, and the positions at the hold's
+            start, overwritten.
         q: Joint positions (N,), overwritten.
         v: Base twist and joint rates (6 + N,), overwritten.
         pose: Base rotation by rows and position (12,), overwritten.
@@ -591,40 +876,70 @@ def advance(
     Returns:
         OK, or the physics step at which the motion has diverged.
     """
-    N, n = q.shape[0], driven.shape[0]
-    h, prescribed = settings[STEP], settings[PRESCRIBED] > 0.0
+    N, n, k = q.shape[0], driven.shape[0], U.shape[1]
+    h, prescribed, first = settings[STEP], settings[PRESCRIBED] > 0.0, int(settings[FIRST])
     free, given = split(driven, 6 + N, prescribed)
     work, own_work = scratch_of(N), scratch_of(n)
     slopes, sum_v, change = np.empty((4, 6 + N)), np.empty(6 + N), np.zeros(6 + N)
     q_stage, v_stage, sum_q = np.empty(N), np.empty(6 + N), np.empty(N)
     power, flows, load = np.empty(3), np.empty(3), np.zeros(6)
-    u, k, sum_u, R, sum_p, p_dot = np.zeros(3), np.empty(3), np.empty(3), np.empty(9), np.empty(3), np.empty(3)
-    own_q, own_v, wanted = np.empty(n), np.empty(6 + n), np.empty(n)
-    spared = U.shape[1]
-    U_base, asked, moved = np.empty((6, spared)), np.empty(spared), np.empty(6)
-    if prescribed:
+    u, w, sum_u, R, sum_p, p_dot = np.zeros(3), np.empty(3), np.empty(3), np.empty(9), np.empty(3), np.empty(3)
+    own_q, own_v, wanted, braking = np.empty(n), np.empty(6 + n), np.empty(n), np.empty(n)
+    axes, own_axes = int(settings[AXES]), int(settings[OWN_AXES])
+    protects = settings[PROTECTS] > 0.0
+    U_base, asked, moved = np.empty((6, k)), np.empty(k), np.empty(6)
+    torque, share = drives[TORQUE], own_work[2 * n + 7 + SHARE]
+    turning, R_piece, per_piece = np.zeros((3, 3)), np.empty(9), int(settings[STEPS_PER_PIECE])
+    if prescribed and first == 0:
         totals[WORK] += jump(parent, tree, free, given, driven, command, q, v, work, change)
     cut = False
-    for step in range(int(settings[STEPS])):
+    for j in range(n):
+        cut = cut or drives[AT_LIMIT, j] > 0.0
+    for step in range(first, int(settings[LAST])):
+        if k > 0 and step % per_piece == 0:
+            start_piece(driven, q, v, step == 0, piece)
+            R_piece[:] = pose[:9]
+            turning[0] = 0.0
+            turning[1] = v[3:6]
         if not prescribed and step % int(settings[STEPS_PER_TORQUE]) == 0:
             span = h * settings[STEPS_PER_TORQUE]
             for c in range(6):
                 own_v[c] = v[c]
             for j in range(n):
                 own_q[j], own_v[6 + j] = q[driven[j]], v[6 + driven[j]]
-                wanted[j] = 2.0 * settings[RATIO] * settings[FREQUENCY] * (command[j] - own_v[6 + j])
-                wanted[j] += settings[FREQUENCY] ** 2 * (reference[j] - own_q[j])
-            rows_in_base(U, pose, settings[INERTIAL] > 0.0, U_base)
-            for i in range(spared):
-                asked[i] = -(settings[FREQUENCY] ** 2) * spared_motion[i]
-                for c in range(6):
-                    asked[i] -= 2.0 * settings[RATIO] * settings[FREQUENCY] * U_base[c, i] * v[c]
-            cut = servo_torque(own_parent, own_tree, own_q, own_v, wanted, U_base, asked, limits, own_work, torques[0])
+                braking[j] = 2.0 * settings[RATIO] * settings[FREQUENCY] * (command[j] - own_v[6 + j])
+                wanted[j] = braking[j] + settings[FREQUENCY] ** 2 * (reference[j] - own_q[j])
+            if protects:
+                rows_in_base(U, axes, work[0], pose, U_base)
+                for i in range(k):
+                    asked[i] = -(settings[FREQUENCY] ** 2) * parts[TRUTH, i]
+                    for c in range(6):
+                        asked[i] -= 2.0 * settings[RATIO] * settings[FREQUENCY] * U_base[c, i] * v[c]
+                cut = servo_torque(own_parent, own_tree, own_q, own_v, wanted, U_base, asked, limits, own_work, torque)
+            else:
+                cut = driven_torque(
+                    own_parent,
+                    own_tree,
+                    own_q,
+                    own_v,
+                    wanted,
+                    braking,
+                    U,
+                    own_axes,
+                    pose,
+                    limits,
+                    own_work,
+                    torque,
+                )
             for j in range(n):
-                if not cut:  # while a drive stands at its limit the reference waits, or it would run away
-                    reference[j] += span * command[j]
+                reference[j] += span * command[j]
+                if cut:
+                    reference[j] += span * (1.0 - share[0]) * (own_v[6 + j] - command[j])
+                drives[AT_LIMIT, j] = 1.0 if cut and abs(torque[j]) >= AT * limits[j] else 0.0
         if cut:
             totals[SATURATED] += h
+            for j in range(n):
+                drives[LIMITED_TIME, j] += h * drives[AT_LIMIT, j]
         loaded = settings[LOAD_FROM] <= step < settings[LOAD_TO]
         for c in range(6):
             load[c] = settings[LOAD + c] if loaded else 0.0
@@ -644,7 +959,7 @@ def advance(
                 # q moves with the velocity of the stage before, which stands in change
                 q_stage[i] = q[i] + (ahead * change[6 + i] if stage > 0 else 0.0)
             for c in range(3):
-                u[c] = ahead * k[c] if stage > 0 else 0.0
+                u[c] = ahead * w[c] if stage > 0 else 0.0
             solved = motion_rates(
                 parent,
                 tree,
@@ -652,7 +967,7 @@ def advance(
                 driven,
                 free,
                 given,
-                torques[0],
+                torque,
                 load,
                 q_stage,
                 v_stage,
@@ -665,14 +980,19 @@ def advance(
             turn(pose[:9], u, R)
             if loaded:
                 add_impulse(R, pose[9:], p_dot, ahead, load, weight, totals[IMPULSE:])
-            rotation_vector_rate(u, v_stage[3:6], k)
+            if k > 0:
+                rows_in_base(U, axes, work[max(axes, 0)], R, U_base)
+                for i in range(k):
+                    for c in range(6):
+                        parts[TRUTH, i] += weight * U_base[c, i] * v_stage[c]
+            rotation_vector_rate(u, v_stage[3:6], w)
             for r in range(3):
                 p_dot[r] = R[3 * r] * v_stage[0] + R[3 * r + 1] * v_stage[1] + R[3 * r + 2] * v_stage[2]
-                sum_u[r] += weight * k[r]
+                sum_u[r] += weight * w[r]
                 sum_p[r] += weight * p_dot[r]
                 flows[r] += weight * power[r]
             for j in range(n):
-                torques[1, j] = max(torques[1, j], abs(torques[0, j]))
+                drives[LARGEST, j] = max(drives[LARGEST, j], abs(torque[j]))
             for i in range(6 + N):
                 change[i] = v_stage[i]
                 sum_v[i] += weight * slopes[stage, i]
@@ -680,12 +1000,10 @@ def advance(
                 sum_q[i] += weight * v_stage[6 + i]
             for c in range(6):
                 moved[c] = (moved[c] if stage > 0 else 0.0) + weight * v_stage[c]
-        if spared > 0:
-            rows_in_base(U, pose, settings[INERTIAL] > 0.0, U_base)
         for c in range(6):
             totals[TWIST + c] += moved[c]
-            for i in range(spared):
-                spared_motion[i] += U_base[c, i] * moved[c]
+        for c in range(3):
+            turning[0, c] += moved[3 + c]
         turn(pose[:9], sum_u, R)
         for c in range(9):
             pose[c] = R[c]
@@ -702,6 +1020,23 @@ def advance(
                 return step
         if largest > DIVERGED:
             return step
+        if k > 0 and ((step + 1) % per_piece == 0 or step + 1 == int(settings[STEPS])):
+            span = h * (step % per_piece + 1)
+            end_piece(driven, q, v, piece)
+            turning[2] = v[3:6]
+            if settings[DIFFERS] > 0.0:
+                start, end = piece[0:2], piece[2:4]
+                model = parts[MODEL]
+                add_motion_of_path(
+                    own_parent, own_tree, U, settings, start, end, span, R_piece, turning, own_work, model
+                )
+            else:
+                parts[MODEL] = parts[TRUTH]
+            plan_piece(command, h * (step + 1) - span, h * (step + 1), piece)
+            start, end = piece[0:2], piece[2:4]
+            add_motion_of_path(
+                own_parent, own_tree, U, settings, start, end, span, R_piece, turning, own_work, parts[PLAN]
+            )
     if prescribed:
         for j in range(n):
             reference[j] = q[driven[j]]

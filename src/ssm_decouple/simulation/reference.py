@@ -12,16 +12,18 @@ from scipy.integrate import DOP853
 from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation, RotationSpline
 
-from ssm_decouple.errors import InputError, as_floats, as_number, as_triple
+from ssm_decouple.errors import InputError, as_floats, as_number, as_triple, shown
 from ssm_decouple.model.payload import possible_inertia
 from ssm_decouple.model.robot import rigid_pose
+from ssm_decouple.settled import Settled, fixed_array
 
 Floats = NDArray[np.float64]
 
+MOST_STEPS = 10**5  # of a tumble's integration, each kept: some 1,600 turns
 _STEPS_A_TURN = 60  # at least, of the tumble's integration: keeps its interpolation as accurate as its steps
 
 
-class Waypoints:
+class Waypoints(Settled):
     """A smooth path through points or poses at given times, at rest at both ends.
 
     Positions follow a cubic spline: velocity and acceleration are continuous between the first and the last time, the
@@ -43,8 +45,10 @@ class Waypoints:
     """
 
     def __init__(self, times: ArrayLike, waypoints: ArrayLike | Sequence[pin.SE3]) -> None:
-        self.times = _rising("waypoint times", times)
-        self.positions, self.rotations = _places(waypoints, self.times.size)
+        self.times: Floats = fixed_array(_rising("waypoint times", times))
+        positions, rotations = _places(waypoints, self.times.size)
+        self.positions: Floats = fixed_array(positions)
+        self.rotations: Floats | None = None if rotations is None else fixed_array(rotations)
         self._path = CubicSpline(self.times, self.positions, bc_type="clamped")
         self._velocity = self._path.derivative()
         self._turn: RotationSpline | None = None
@@ -102,7 +106,7 @@ class Waypoints:
         return time, 1.0
 
 
-class TumblingTarget:
+class TumblingTarget(Settled):
     """A point on a rigid body that tumbles freely: torque-free rotation, centre of mass in uniform motion.
 
     The angular momentum L stays in inertial axes, so that the attitude R alone is integrated, under the body rate
@@ -145,13 +149,16 @@ class TumblingTarget:
         self._grasp = as_triple("target grasp_point", grasp_point)
         spin = as_triple("target angular_velocity", angular_velocity)
         R = self._start.rotation
-        self.angular_momentum: Floats = R @ self._inertia @ R.T @ spin
-        self.angular_momentum.flags.writeable = False
         self._inverse = np.linalg.inv(self._inertia)
+        with np.errstate(over="ignore", invalid="ignore"):  # looked at below
+            self.angular_momentum: Floats = fixed_array(R @ self._inertia @ R.T @ spin)
+            fastest = float(np.linalg.norm(self.angular_momentum) * np.linalg.norm(self._inverse, 2))
         self._momentum, self._half_inverse = self.angular_momentum.tolist(), (0.5 * self._inverse).tolist()
-        self._prepare(float(np.linalg.norm(self.angular_momentum) * np.linalg.norm(self._inverse, 2)))
+        self._prepare(fastest)
 
     def _prepare(self, fastest: float) -> None:
+        if not fastest < np.inf:
+            raise InputError("target angular_velocity: its angular momentum is beyond the largest number")
         quaternion = pin.Quaternion(self._start.rotation).normalized().coeffs()
         step = 2 * np.pi / (_STEPS_A_TURN * fastest) if fastest > 0 else np.inf
         self._solver = DOP853(self._slope, 0.0, quaternion, np.inf, max_step=step, rtol=1e-13, atol=1e-15)
@@ -181,7 +188,7 @@ class TumblingTarget:
         """
         R = self._rotation(time)
         arm, spin = R @ self._grasp, R @ self._body_rate(R)
-        return self._start.translation + float(time) * self._velocity + arm, self._velocity + pin.skew(spin) @ arm
+        return self._centre(time) + arm, self._velocity + pin.skew(spin) @ arm
 
     def pose(self, time: float) -> pin.SE3:
         """Return the pose in the inertial frame of the body's axes, whose origin is its centre of mass.
@@ -189,7 +196,7 @@ class TumblingTarget:
         Raises:
             InputError: a time before 0, or not finite.
         """
-        return pin.SE3(self._rotation(time), self._start.translation + float(time) * self._velocity)
+        return pin.SE3(self._rotation(time), self._centre(time))
 
     def twist(self, time: float) -> Floats:
         """Return velocity of the centre of mass and angular velocity (6,), m/s and rad/s, inertial axes.
@@ -200,10 +207,20 @@ class TumblingTarget:
         R = self._rotation(time)
         return np.r_[self._velocity, R @ self._body_rate(R)]
 
+    def _centre(self, time: float) -> Floats:
+        return self._start.translation + as_number("time", time) * self._velocity
+
     def _rotation(self, time: float) -> Floats:
         now = as_number("time", time)
         if now < 0:
             raise InputError(f"the target's motion starts at time 0; {now:g} s is before")
+        ahead = (now - self._times[-1]) / self._solver.max_step
+        if len(self._times) + ahead > MOST_STEPS:
+            raise InputError(
+                f"time is {now:g} s: the target's tumble takes {len(self._times) + ahead:.3g} steps of "
+                f"{self._solver.max_step:.3g} s until then, {MOST_STEPS:g} at most; start it nearer to that time, or "
+                "let it turn more slowly"
+            )
         while now >= self._times[-1]:
             self._solver.step()
             self._times.append(self._solver.t)
@@ -234,5 +251,5 @@ def _places(waypoints: ArrayLike | Sequence[pin.SE3], count: int) -> tuple[Float
 def _rising(name: str, values: ArrayLike) -> Floats:
     times = as_floats(name, values)
     if times.ndim != 1 or times.size < 2 or not np.all(np.isfinite(times)) or not np.all(np.diff(times) > 0):
-        raise InputError(f"{name} are {times.tolist()}; they need two or more finite numbers that rise, s")
+        raise InputError(f"{name} are {shown(times.tolist())}; they need two or more finite numbers that rise, s")
     return times

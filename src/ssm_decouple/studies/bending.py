@@ -13,7 +13,7 @@ from ssm_decouple.control.schedule import Schedule
 from ssm_decouple.errors import InputError
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.dynamic import Dynamic, Servo
-from ssm_decouple.studies.case import Case
+from ssm_decouple.studies.case import Case, checked_case
 from ssm_decouple.studies.comparison import largest_rotation_deg
 
 FLEXIBLE = "ets_vii_flexible"
@@ -61,7 +61,7 @@ def flexible(case: Case) -> Case:
     Raises:
         InputError: the case's robot has no appendages and is not the ETS-VII.
     """
-    if case.robot.appendages:
+    if checked_case(case).robot.appendages:
         return case
     if case.robot_source != "ets_vii":
         raise InputError(

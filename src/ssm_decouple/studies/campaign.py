@@ -20,11 +20,23 @@ from numpy.typing import NDArray
 from ssm_decouple.batch import Batch
 from ssm_decouple.control.law import SelectiveLaw
 from ssm_decouple.control.schedule import Schedule
-from ssm_decouple.errors import DecoupleError, DecoupleWarning, FileError, InputError, as_seed, unknown
+from ssm_decouple.errors import (
+    DecoupleError,
+    DecoupleWarning,
+    FileError,
+    InputError,
+    as_function,
+    as_kind,
+    as_path,
+    as_seed,
+    as_whole,
+    unknown,
+)
 from ssm_decouple.model.appendage import Appendage
 from ssm_decouple.model.perturb import Tolerances, perturbed
 from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.settled import Settled, fixed
 from ssm_decouple.simulation.dynamic import Dynamic
 from ssm_decouple.studies.case import Case, case_of, cases, load_case
 from ssm_decouple.studies.schema import LIST, NUMBER, TEXT, check_keys
@@ -38,7 +50,9 @@ Rows = dict[str, NDArray[Any]]  # a column's name to its values, a row a sample
 FAILED = "failed"  # the outcome of a sample that could not be computed
 OWN = "case"  # the protection that is the case's own
 CHUNK = 500  # samples, where a campaign does not say
-MOST_SAMPLES = 2**53  # a row number that is a whole number everywhere
+MOST_SAMPLES = 10**10  # rows in all: years of computing
+MOST_IN_CHUNK = 10**6  # samples, which take a gigabyte while they are computed
+MOST_CHUNKS = 10**6  # each a few files
 
 _NAMES = "a list of names, such as ['case1']"
 _SPREAD = "a table of one entry, such as { uniform = .. }"
@@ -116,7 +130,7 @@ class Drawn:
 
 
 @dataclass
-class Campaign:
+class Campaign(Settled):
     """Cases crossed with protections, each combination sampled many times.
 
     Rows are numbered case by case, protection by protection, sample by sample. All that a row rests on is the record:
@@ -137,6 +151,7 @@ class Campaign:
     cases: tuple[Case, ...] = field(init=False)
 
     def __post_init__(self) -> None:
+        self.record = fixed(as_kind("record", self.record, Mapping, "read a campaign with Campaign.load(..)"))  # type: ignore[type-abstract]
         self.cases = tuple(_rebuilt(told) for told in self.record["cases"])
         for case in self.cases:
             self._refuse_unfit(case)
@@ -154,13 +169,13 @@ class Campaign:
             InputError: no such file, not TOML, an unknown key (the nearest known one is named), a missing key, a value
                 that makes no sense, or a case that cannot be run.
         """
-        source = Path(path).expanduser()
+        source = as_path("campaign", path)
         try:
             text = source.read_text(encoding="utf-8")
             spec = tomllib.loads(text)
         except OSError as error:
             raise InputError(f"cannot read the campaign '{path}': {error.strerror or error}") from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        except (ValueError, RecursionError) as error:  # not UTF-8, a number of thousands of digits, tables without end
             raise InputError(f"'{path}' is not TOML: {error}") from error
         try:
             _validate(spec)
@@ -227,7 +242,7 @@ class Campaign:
         Raises:
             InputError: no such row.
         """
-        if not 0 <= row < self.size:
+        if as_whole("sample", row, -1) not in range(self.size):
             raise InputError(f"there is no sample {row}: they are numbered from 0 to {self.size - 1}")
         combination, draw = divmod(row, self.samples)
         case, protection = divmod(combination, len(self.protections))
@@ -326,7 +341,7 @@ class Campaign:
         progress: Callable[[int, int], object] | None = None,
         note: Callable[[str], object] | None = None,
     ) -> xr.Dataset:
-        """Compute every sample that a store does not hold yet, chunk by chunk.
+        """Compute every sample that a store does not hold yet, or not whole, chunk by chunk.
 
         Args:
             store: Folder of the Zarr store.
@@ -334,7 +349,8 @@ class Campaign:
             scheduler: Address of a Dask scheduler, whose workers compute instead.
             resume: Go on with a store that is there.
             progress: Called after each chunk with the number of samples that are there, and of all.
-            note: Called with lines that a user may want to read: a cluster's dashboard, a worker that died.
+            note: Called with lines that a user may want to read: a cluster's dashboard, a worker that died, what of
+                the store was damaged and is made again.
 
         Returns:
             The store, opened by xarray.
@@ -348,12 +364,17 @@ class Campaign:
         from ssm_decouple.studies.store import Store
         from ssm_decouple.studies.workers import Interrupts, pool_of
 
+        as_function("progress", progress)
+        as_function("note", note)
         with ExitStack() as open_things:
             interrupts = open_things.enter_context(Interrupts())
             with interrupts.held():
                 kept = open_things.enter_context(Store.writing(store, self, resume))
                 todo, there = kept.missing(), kept.samples_done
-            pool = pool_of(self, workers, scheduler, note or (lambda _: None))
+            note = note or (lambda _: None)
+            for fault in kept.mended:
+                note(f"damaged, and made again: {fault}")
+            pool = pool_of(self, workers, scheduler, note)
             if progress is not None:
                 progress(there, self.size)
             results = open_things.enter_context(closing(pool.results(todo)))
@@ -584,13 +605,19 @@ def _validate(spec: Mapping[str, Any]) -> None:
     for key in spec.keys() & {"samples", "chunk"}:
         if not (isinstance(spec[key], int) and spec[key] > 0):
             raise InputError(f"{key} is {spec[key]!r}; it must be a whole number above 0")
+    chunk = spec.get("chunk", CHUNK)
+    if chunk > MOST_IN_CHUNK:
+        raise InputError(f"chunk is {chunk}; a chunk is computed in memory, and holds {MOST_IN_CHUNK} samples at most")
     _check_names(spec, "cases")
     if "protections" in spec:
         _check_names(spec, "protections")
         for word in spec["protections"]:
             _protection(word)
-    if spec["samples"] * len(spec["cases"]) * len(spec.get("protections", OWN)) > MOST_SAMPLES:
-        raise InputError(f"samples is {spec['samples']}: more rows than can be numbered")
+    rows = spec["samples"] * len(spec["cases"]) * len(spec.get("protections", (OWN,)))
+    if rows > MOST_SAMPLES:
+        raise InputError(f"samples is {spec['samples']}: more than {MOST_SAMPLES:g} rows in all; take fewer")
+    if rows > MOST_CHUNKS * chunk:
+        raise InputError(f"samples is {spec['samples']}: {rows // chunk} chunks; give a chunk more than {chunk}")
     for table, quantities in _QUANTITIES.items():
         for key, given in spec.get(table, {}).items():
             if key not in quantities:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import tomllib
 import xml.etree.ElementTree as ET
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -28,10 +27,24 @@ from ssm_decouple.control.task import (
     RelativePoseTask,
     Task,
 )
-from ssm_decouple.errors import DecoupleError, InputError, as_floats, unknown
+from ssm_decouple.errors import (
+    DecoupleError,
+    InputError,
+    as_floats,
+    as_kind,
+    as_path,
+    as_positive,
+    as_text,
+    as_triple,
+    is_function,
+    shown,
+    unknown,
+)
+from ssm_decouple.files import is_file
 from ssm_decouple.model.catalogue import load_robot, models
 from ssm_decouple.model.robot import Robot
-from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.momentum.protection import Protection, checked_protection
+from ssm_decouple.settled import FixedArrays, fixed, fixed_array
 from ssm_decouple.simulation.dynamic import Dynamic, Servo
 from ssm_decouple.simulation.simulate import Progress, simulate
 from ssm_decouple.simulation.steps import STEPS
@@ -47,6 +60,7 @@ from ssm_decouple.studies.schema import (
     TEXT,
     TURNS,
     check_keys,
+    read_toml,
 )
 
 if TYPE_CHECKING:
@@ -122,8 +136,8 @@ _ANY_TASK = {"kind": (TEXT, True), "gain": (NUMBER, False), "weight": (NUMBER, F
 
 
 @dataclass(frozen=True)
-class Case:
-    """One motion to simulate. Units are SI and radians.
+class Case(FixedArrays):
+    """One motion to simulate. Units are SI and radians. What it holds is read-only: `dataclasses.replace` changes it.
 
     Attributes:
         name: Short name, used for file names.
@@ -159,6 +173,34 @@ class Case:
     simulation: Mapping[str, Any] = field(default_factory=dict)
     turned: Mapping[str, float] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        """Refuse what is no case, and keep copies that stay as they are.
+
+        Raises:
+            InputError: a setting of another kind; the message names it.
+        """
+        as_text("name of a case", self.name)
+        as_path("robot of a case", self.robot_source)
+        if not isinstance(self.protection, Schedule):
+            checked_protection(self.protection)
+        joints = self.joints
+        if joints is not None:
+            joints = fixed(joints) if isinstance(joints, Mapping) else fixed_array(as_floats("joints", joints))
+            if isinstance(joints, np.ndarray) and (joints.ndim != 1 or not np.all(np.isfinite(joints))):
+                raise InputError(f"joints is {shown(joints.tolist())}; it needs finite numbers, one a joint")
+        kept: dict[str, Any] = {"joints": joints, "target": fixed(self.target)}
+        if not (is_function(self.target) or (isinstance(self.law, Mapping) and self.law.get("tasks"))):
+            kept["target"] = tuple(as_triple("target", self.target, "inertial axes").tolist())
+        for name in ("base_position", "base_rpy"):
+            kept[name] = tuple(as_triple(name, getattr(self, name)).tolist())
+        for name in ("duration", "dt"):
+            kept[name] = as_positive(name, getattr(self, name), "it must be a positive time, s")
+        for name in ("law", "simulation", "turned"):
+            mend = "give a table of settings by name"
+            kept[name] = fixed(as_kind(name, getattr(self, name), Mapping, mend))  # type: ignore[type-abstract]
+        for name, value in kept.items():
+            object.__setattr__(self, name, value)
+
     @cached_property
     def robot(self) -> Robot:
         """The robot, loaded when first asked for, its appendages turned as the case has them."""
@@ -184,9 +226,10 @@ class Case:
 
     def make_law(self, protection: Protection | Schedule | None = None, dt: float | None = None) -> SelectiveLaw:
         """Return the case's law, with another protection or time between samples than its own if one is given."""
-        step = self.dt if dt is None else dt
+        step = self.dt if dt is None else as_positive("dt", dt, "it must be a positive time, s")
         planned = bool(self.law.keys() & {"hold_nodes", "acceleration_limit", "limits"})
-        chosen, sample_time = protection or self.protection, step if planned else None
+        chosen = self.protection if protection is None else protection
+        sample_time = step if planned else None
         if isinstance(chosen, Schedule):
             return ScheduledLaw(self.robot, chosen, sample_time=sample_time, **self.law)
         return SelectiveLaw(self.robot, chosen, sample_time=sample_time, **self.law)
@@ -215,15 +258,29 @@ class Case:
             law, start = self.make_law(protection, dt), self.start()
             motion = simulate(law, start, self.target, self.duration, step, progress=progress, **self.simulation)
         except InputError as error:
-            raise InputError(f"case '{self.name}': {error}") from error
+            told = InputError(f"case '{self.name}': {error}")
+            if hasattr(error, "motion"):
+                told.motion = error.motion  # type: ignore[attr-defined]
+            raise told from error
         motion.attrs |= {
             "case": self.name,
             "title": self.title,
             "case_U_c": json.dumps(self.protection.U_twist.tolist()),
             "case_frame": self.protection.frame,
+            "case_schedule": json.dumps(self.protection.settings() if isinstance(self.protection, Schedule) else None),
             "turned": json.dumps(dict(self.turned)),
         }
         return motion
+
+
+def checked_case(case: Case) -> Case:
+    """Return a case.
+
+    Raises:
+        InputError: it is none; the message says how one is loaded.
+    """
+    mend = f"load it with load_case({shown(case)})" if isinstance(case, str) else "load one with load_case(..)"
+    return as_kind("case", case, Case, mend)
 
 
 def cases() -> dict[str, Path]:
@@ -245,17 +302,11 @@ def load_case(source: str | Path) -> Case:
             of the wrong kind.
     """
     catalogue = cases()
-    path = catalogue.get(str(source), Path(source).expanduser())
-    try:
-        found = path.is_file()
-    except OSError:  # a name too long to be one
-        found = False
-    if not found:
+    path = as_path("case", source, f"give a path, or one of the cases {', '.join(catalogue)}")
+    path = catalogue.get(str(source), path)
+    if not is_file(path):
         raise InputError(f"'{source}' is neither a file nor one of the cases {', '.join(catalogue)}")
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"'{path}' is not TOML: {error}") from error
+    content, _ = read_toml(path)
     try:
         return case_of(content, path)
     except DecoupleError as error:
@@ -348,9 +399,11 @@ def _tasks(content: Mapping[str, Any]) -> tuple[list[Task], Any]:
     return tasks, targets[0] if len(targets) == 1 else targets
 
 
-def _task(table: Mapping[str, Any], place: str) -> tuple[Task, Any]:
+def _task(table: Any, place: str) -> tuple[Task, Any]:
+    if not isinstance(table, dict):
+        raise InputError(f"{place}is {table!r}; it must be a table")
     kind = table.get("kind")
-    if kind not in _TASKS:
+    if not isinstance(kind, str) or kind not in _TASKS:
         raise InputError(f"{place}{unknown('kind', str(kind), list(_TASKS))}")
     made, keys = _TASKS[kind]
     check_keys(table, {**_ANY_TASK, **keys}, place)
@@ -419,6 +472,8 @@ def _validate(content: dict[str, Any]) -> None:
     for table, keys in _SCHEMA.items():
         values = content.get(table, {}) if table else {k: v for k, v in content.items() if k not in tables}
         check_keys(values, keys, f"[{table}] " if table else "")
+    if "protection" not in content:
+        raise InputError("[protection] is missing; it needs axes")
     for number, phase in enumerate(content["protection"].get("phases", []), 1):
         check_keys(phase, {"from": (NUMBER, True), "axes": (AXES, True)}, f"[protection] phase {number} ")
     method = content["simulation"].get("method", "explicit")

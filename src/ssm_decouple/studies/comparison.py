@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
@@ -13,11 +14,14 @@ import numpy as np
 import xarray as xr
 
 from ssm_decouple.control.schedule import Schedule
+from ssm_decouple.errors import DecoupleWarning, InputError, as_kind
 from ssm_decouple.files import written_whole
-from ssm_decouple.model.robot import Robot
 from ssm_decouple.momentum.protection import Protection
-from ssm_decouple.simulation.motion import error_of, protected_integral, robot_of, twist_along
-from ssm_decouple.studies.case import Case
+from ssm_decouple.simulation.dynamic import drives_at_limits
+from ssm_decouple.simulation.motion import error_of, robot_of
+from ssm_decouple.simulation.replay import integral_along, rates_along
+from ssm_decouple.simulation.telling import sentences
+from ssm_decouple.studies.case import Case, checked_case
 
 LAWS = ("none", "selective", "reactionless")
 UNDAMPED = ", undamped"  # behind a law's name: the same with rho = 0
@@ -37,9 +41,11 @@ class Summary:
         start_distance_m: End-effector to target at the start.
         final_error_m: The same at the end.
         final_position_m: Where the end-effector is at the end, inertial axes.
-        w_sub_max_rad_s: Largest base angular velocity about any of the case's protected directions. Where those are of
-            the whole twist, the largest rate along any of them: m counts as rad, here and in what follows.
-        protected_angle_deg: Largest rotation from the start about any of them, summed over the samples.
+        w_sub_max_rad_s: Largest base angular velocity about any of the case's protected directions, at the samples or,
+            of a law that plans for the hold, as mean over it. Where those are of the whole twist, the largest rate
+            along any of them: m counts as rad, here and in what follows.
+        protected_angle_deg: Largest true rotation from the start about any of them. Of a schedule, under whatever law,
+            both count while it protects the direction, the rotation from then on.
         roll_deg: Base roll, peak to peak.
         pitch_deg: Base pitch, peak to peak.
         yaw_deg: Base yaw, peak to peak.
@@ -53,7 +59,9 @@ class Summary:
             integrator's error, zero in physics.
         saturated: In a dynamic simulation, from when to when, s, a drive stood at its torque limit.
         full_wheels: Which reaction wheels were at full speed, and from when to when, in words.
+        limited_drives: Which drives stood at their torque limits, how long, and what it cost the protection, in words.
         lost: Of a stalled motion the direction that its tasks could move least at the end, and what took it, in words.
+        told: What was promised and not kept, in words: see `simulate`.
     """
 
     case: str
@@ -79,7 +87,9 @@ class Summary:
     centre_of_mass_drift_m: float
     saturated: tuple[tuple[float, float], ...] = ()
     full_wheels: str = ""
+    limited_drives: str = ""
     lost: str = ""
+    told: str = ""
 
 
 def summarise(motion: xr.Dataset, law: str) -> Summary:
@@ -89,6 +99,9 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         motion: A motion of a case, from `Case.run`.
         law: What the row is called.
     """
+    as_kind("motion", motion, xr.Dataset, "give a motion of a case, as Case.run(..) returns it")
+    if "case_U_c" not in motion.attrs:
+        raise InputError("the motion is of no case; give one that Case.run(..) returns")
     time, error = motion.time.values, error_of(motion)
     rate, angle = disturbance(motion)
     swing = np.rad2deg(np.ptp(motion.base_rpy.values, axis=0))
@@ -123,7 +136,9 @@ def summarise(motion: xr.Dataset, law: str) -> Summary:
         centre_of_mass_drift_m=float(np.linalg.norm(drift, axis=1).max()),
         saturated=tuple((start, end) for start, end in json.loads(motion.attrs.get("saturated", "[]"))),
         full_wheels=full_wheels(motion),
+        limited_drives=drives_at_limits(motion),
         lost=lost_direction(motion),
+        told="; ".join(sentences(motion)),
     )
 
 
@@ -164,23 +179,35 @@ def disturbance(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[An
     """
     U_c, frame = np.array(json.loads(motion.attrs["case_U_c"])).reshape(6, -1), motion.attrs["case_frame"]
     if np.array_equal(U_c, motion.U_c.values) and frame == json.loads(motion.attrs["law"])["frame"]:
-        return _while_on(motion)
-    twists = np.hstack([motion.base_linear_velocity.values, motion.base_angular_velocity.values])
-    robot, configurations = _robot_with(frame, motion), motion.configuration.values
-    rate = twist_along(U_c, frame, twists, configurations, robot)
-    angle = protected_integral(U_c, frame, motion.base_twist_integral.values, configurations, robot)
-    return rate, angle
+        rate, angle = motion.protected_rate.values, motion.protected_angle.values
+    else:
+        rate, angle = rates_along(motion, U_c, frame), integral_along(motion, U_c, frame)
+    shares = _shares_of_case(motion, frame)
+    return (rate, angle) if shares is None else _while_on(rate, angle, shares)
 
 
-def _while_on(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
-    """Return protected rate and angle; under a schedule zero while a direction is not fully protected.
+def _shares_of_case(motion: xr.Dataset, frame: str) -> np.ndarray[Any, Any] | None:
+    """Return how far the case protects each of its directions (m, k), 0 to 1, by time; None where it always does."""
+    told = json.loads(motion.attrs.get("case_schedule", "null"))
+    if told is None:
+        return None
+    steps = [(step["start"], Protection(np.reshape(step["U_c"], (6, -1)), frame)) for step in told]
+    return _shares(Schedule(steps, hand_over=told[0]["hand_over"]), motion)
+
+
+def _shares(schedule: Schedule, motion: xr.Dataset) -> np.ndarray[Any, Any]:
+    places = zip(motion.time.values.tolist(), motion.configuration.values, strict=True)
+    return np.array([schedule.shares(*schedule.at(time, q)) for time, q in places]).reshape(-1, schedule.k)
+
+
+def _while_on(
+    rate: np.ndarray[Any, Any], angle: np.ndarray[Any, Any], shares: np.ndarray[Any, Any]
+) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Return rate and angle of directions, zero while one is not fully protected.
 
     The angle of a direction is counted from when it came to be.
     """
-    rate, angle = motion.protected_rate.values, motion.protected_angle.values
-    if "protection_share" not in motion:
-        return rate, angle
-    on = motion.protection_share.values == 1.0
+    on = shares == 1.0
     rate, angle = np.where(on, rate, 0.0), angle.copy()
     for i in range(on.shape[1]):
         begun = np.flatnonzero(on[:, i] & ~np.r_[False, on[:-1, i]])
@@ -190,22 +217,22 @@ def _while_on(motion: xr.Dataset) -> tuple[np.ndarray[Any, Any], np.ndarray[Any,
     return rate, angle
 
 
-def _robot_with(frame: str, motion: xr.Dataset) -> Robot | None:
-    return None if frame in ("base", "inertial") else robot_of(motion)
-
-
 def largest_rotation_deg(motion: xr.Dataset, protection: Protection | Schedule) -> float:
     """Return the largest true rotation of the base about directions, deg, whatever the motion's law protects.
 
     Args:
         motion: Any motion.
-        protection: The directions. Of rows of the whole twist the angular part counts.
+        protection: The directions. Of rows of the whole twist the angular part counts; under a schedule a direction
+            counts while it is fully protected, from when it came to be.
     """
     turning = protection.U_twist.copy()
     turning[:3] = 0.0
-    twists, configurations = motion.base_twist_integral.values, motion.configuration.values
-    robot = _robot_with(protection.frame, motion)
-    turned = protected_integral(turning, protection.frame, twists, configurations, robot)
+    own = np.array_equal(turning, motion.U_c.values) and protection.frame == json.loads(motion.attrs["law"])["frame"]
+    if own and not isinstance(protection, Schedule):
+        return float(np.rad2deg(np.abs(motion.protected_angle.values).max(initial=0.0)))  # as good as its method has it
+    turned = integral_along(motion, turning, protection.frame)
+    if isinstance(protection, Schedule):
+        _, turned = _while_on(turned, turned, _shares(protection, motion))
     return float(np.rad2deg(np.abs(turned).max(initial=0.0)))
 
 
@@ -221,6 +248,15 @@ class Comparison:
 
     case: Case
     motions: Mapping[str, xr.Dataset]
+
+    def __post_init__(self) -> None:
+        """Refuse what is no case, or no table of motions.
+
+        Raises:
+            InputError: the message names it.
+        """
+        checked_case(self.case)
+        as_kind("motions", self.motions, Mapping, "give motions by the name of their law")  # type: ignore[type-abstract]
 
     def summaries(self) -> list[Summary]:
         """Return one row of figures a law."""
@@ -255,10 +291,13 @@ def compare_step_by_step(
         The law's name and the motion. Where the damping acted, the same law undamped follows: how a singular system is
         regularised decides where the arm ends, so both are shown.
     """
-    undamped = replace(case, law={**case.law, "damping": 0.0})
+    undamped = replace(checked_case(case), law={**case.law, "damping": 0.0})
 
     def run(law: str, variant: Case, protection: Protection | Schedule) -> xr.Dataset:
-        return variant.run(protection, dt, None if progress is None else lambda share: progress(law, share))
+        with warnings.catch_warnings():
+            if law != "selective":  # beside the case's own law the rows of the comparison tell
+                warnings.simplefilter("ignore", DecoupleWarning)
+            return variant.run(protection, dt, None if progress is None else lambda share: progress(law, share))
 
     for law, protection in laws_of(case).items():
         motion = run(law, case, protection)
@@ -280,7 +319,7 @@ def compare(case: Case, dt: float | None = None) -> Comparison:
     Raises:
         DecoupleError: the case cannot be run; the message says why.
     """
-    return Comparison(case, dict(compare_step_by_step(case, dt)))
+    return Comparison(checked_case(case), dict(compare_step_by_step(case, dt)))
 
 
 def write_csv(rows: Sequence[Any], path: str | Path) -> Path:

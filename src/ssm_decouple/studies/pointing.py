@@ -10,9 +10,10 @@ import numpy as np
 import xarray as xr
 from numpy.typing import ArrayLike, NDArray
 
+from ssm_decouple.errors import InputError, as_kind, as_triple
 from ssm_decouple.momentum.protection import Protection
 from ssm_decouple.simulation.dynamic import Dynamic, Servo
-from ssm_decouple.studies.case import Case
+from ssm_decouple.studies.case import Case, checked_case
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +58,11 @@ def pointing_error(motion: xr.Dataset, boresight: ArrayLike) -> Floats:
     """Return the angle between a line of sight fixed in base axes and where it looked at the start (m,), rad."""
     from scipy.spatial.transform import Rotation
 
-    line = np.asarray(boresight, dtype=float) / np.linalg.norm(boresight)
+    as_kind("motion", motion, xr.Dataset, "give what simulate(..) returns")
+    line = as_triple("boresight", boresight, "base axes")
+    if not np.any(line):
+        raise InputError("boresight is zero; it needs a direction")
+    line = line / np.linalg.norm(line)
     lines = Rotation.from_quat(motion.base_quaternion.values).apply(line)
     across = np.linalg.norm(np.cross(lines, lines[0]), axis=1)
     return np.arctan2(across, lines @ lines[0])
@@ -83,8 +88,9 @@ def pointing(
     Raises:
         InputError: the boresight is zero or not finite.
     """
+    checked_case(case)
     sight = Protection.boresight(boresight)
-    physics = physics or Dynamic()
+    physics = Dynamic() if physics is None else as_kind("physics", physics, Dynamic, "give a Dynamic, or None")
     in_servo = replace(physics, servo=replace(physics.servo or Servo(), protects=True))
     laws = {
         "none": (Protection("none"), 0, physics),
@@ -103,7 +109,7 @@ def pointing(
         )
         motion = variant.run(protection, progress=None if progress is None else partial(progress, name))
         error = ARCSEC * pointing_error(motion, boresight)
-        motion.attrs["boresight"] = np.asarray(boresight, dtype=float).tolist()
+        motion.attrs["boresight"] = as_triple("boresight", boresight).tolist()
         yield (
             Pointing(
                 case=case.name,

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ssm_decouple.errors import InputError
-from ssm_decouple.model.robot import UNLIMITED, Robot
+from ssm_decouple.model.robot import UNLIMITED, Robot, checked_robot
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ def joint_ranges(robot: Robot) -> Floats:
     Raises:
         InputError: a joint that slides has no limits, or a joint's limits leave it no room; it is named.
     """
-    ranges = robot.position_limits.copy()
+    ranges = checked_robot(robot).position_limits.copy()
     for i, name in enumerate(robot.joint_names):
         low, high = ranges[i]
         bounded = max(abs(low), abs(high)) < UNLIMITED

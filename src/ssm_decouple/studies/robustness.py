@@ -6,18 +6,31 @@ import signal
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor, as_completed
 from dataclasses import dataclass, field, replace
+from typing import ClassVar
 
 import numpy as np
 
-from ssm_decouple.errors import InputError, as_seed
+from ssm_decouple.errors import (
+    InputError,
+    as_items,
+    as_not_negative,
+    as_number,
+    as_positive,
+    as_seed,
+    as_whole,
+    shown,
+)
 from ssm_decouple.model.perturb import Tolerances, perturbed
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.settled import Settled
 from ssm_decouple.simulation.dynamic import Dynamic, Load, Sensors, Servo
-from ssm_decouple.studies.case import Case
+from ssm_decouple.studies.case import Case, checked_case
 from ssm_decouple.studies.comparison import largest_rotation_deg
 
 LEVELS = (0.01, 0.02, 0.05, 0.1)
 RUNS = 200
+MOST_RUNS = 10**5
+MOST_WORKERS = 1024
 FEEDBACK_GAIN = 1.0  # 1/s
 STEP = 0.02  # s: of the physics, a quarter of the servo's radian
 METRES_PER_LEVEL = 0.1  # what a tolerance of 1 stands for where lengths are concerned: 5 % is 5 mm
@@ -92,7 +105,7 @@ def true_rotation(case: Case, physics: Dynamic, protection: Protection | None = 
     """Run a case and return the largest true rotation about its protected axes, deg, what is left, m, and arrival."""
     variant = replace(
         case,
-        law={**case.law, "hold_nodes": 1},
+        law={**checked_case(case).law, "hold_nodes": 1},
         simulation={**case.simulation, "method": physics},
     )
     motion = variant.run(protection)
@@ -102,6 +115,7 @@ def true_rotation(case: Case, physics: Dynamic, protection: Protection | None = 
 
 def tolerances_at(level: float) -> Tolerances:
     """Return the tolerances of a level of error."""
+    level = as_not_negative("level", level)
     length = METRES_PER_LEVEL * level
     return Tolerances(level, level, length, length, length)
 
@@ -113,7 +127,7 @@ def _one_run(case: Case, level: float, gain: float, seed: int) -> tuple[float, b
 
 
 @dataclass
-class Robustness:
+class Robustness(Settled):
     """A Monte Carlo study of one case, in worker processes; what is done stays when it is interrupted.
 
     Attributes:
@@ -126,6 +140,8 @@ class Robustness:
         found: Results so far: (level, gain) to plant number to rotation, deg, and whether the end-effector arrived.
         unprotected: The rotation with nothing protected and no error, deg; computed before the first plant.
     """
+
+    _assignable: ClassVar[tuple[str, ...]] = ("unprotected",)
 
     case: Case
     levels: Sequence[float] = LEVELS
@@ -143,16 +159,21 @@ class Robustness:
             InputError: a level outside (0, 1), no runs, no worker, a gain that is not positive, or a case that does not
                 protect rotation alone.
         """
+        checked_case(self.case)
+        self.levels = tuple(as_number("level", level) for level in as_items("levels", self.levels, "give a list"))
         for level in self.levels:
             if not 0 < level < 1:
                 raise InputError(f"level {level} is no tolerance: give shares above 0 and below 1, 0.05 for 5 %")
-        if self.runs < 1:
-            raise InputError(f"{self.runs} runs are no study; give at least 1")
-        if not self.feedback_gain > 0:
-            raise InputError(f"feedback_gain is {self.feedback_gain}; it must be positive, 1/s")
-        if self.workers < 1:
-            raise InputError(f"{self.workers} workers do nothing; give at least 1")
-        as_seed("seed", self.seed)
+        for name, most, wrong in (
+            ("runs", MOST_RUNS, "runs are no study"),
+            ("workers", MOST_WORKERS, "workers do nothing"),
+        ):
+            try:
+                setattr(self, name, as_whole(name, getattr(self, name), most=most))
+            except InputError:
+                raise InputError(f"{shown(getattr(self, name))} {wrong}; give from 1 to {most:,}") from None
+        self.feedback_gain = as_positive("feedback_gain", self.feedback_gain, "it must be positive, 1/s")
+        self.seed = as_seed("seed", self.seed)
         if self.case.protection.k == 0 or np.any(self.case.protection.U_twist[:3]):
             raise InputError(f"case '{self.case.name}' needs a protection of rotation: one to three directions")
 

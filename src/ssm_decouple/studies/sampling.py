@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ssm_decouple.studies.case import Case
+from ssm_decouple.errors import as_function, as_items, as_positive
+from ssm_decouple.studies.case import Case, checked_case
+from ssm_decouple.studies.comparison import disturbance
 
 SAMPLE_TIMES = (0.02, 0.05, 0.1, 0.2, 0.5)
 PLANS = {0: "at the sample", 1: "middle of the hold", 2: "two Gauss points", 3: "three Gauss points"}
@@ -47,13 +49,17 @@ def sampling(
     left is the law's own error.
 
     Args:
-        case: The case; its protection should be fixed in base axes.
+        case: The case.
         sample_times: Times between samples, s.
         progress: Called now and then with hold nodes, sample time and the share of that motion that is done.
 
     Yields:
         One result for each way and time, from the longest time to the shortest.
     """
+    checked_case(case)
+    as_function("progress", progress)
+    given = as_items("sample_times", sample_times, "give a list of times, s")
+    sample_times = [as_positive("sample time", time, "it must be a positive time, s") for time in given]
     for nodes in PLANS:
         before: Drift | None = None
         for dt in sorted(sample_times, reverse=True):
@@ -62,7 +68,7 @@ def sampling(
             )
             tick = None if progress is None else lambda share, dt=dt, nodes=nodes: progress(nodes, dt, share)
             motion = variant.run(dt=dt, progress=tick)
-            drift = float(np.rad2deg(np.abs(motion.protected_angle.values).max(initial=0.0)))
+            drift = float(np.rad2deg(np.abs(disturbance(motion)[1]).max(initial=0.0)))
             order: float | None = None
             if before is not None and drift > 1e-14:
                 order = float(np.log(before.drift_deg / drift) / np.log(before.sample_time_s / dt))

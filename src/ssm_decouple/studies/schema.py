@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import sys
+import tomllib
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 from ssm_decouple.errors import InputError, unknown
@@ -19,7 +22,24 @@ NAMES = "a list of names"
 LIST = "a list of numbers"
 PHASES = "a list of tables { from = .., axes = .. }"
 
+LARGEST = sys.float_info.max
+
 Keys = Mapping[str, tuple[str, bool]]  # a key's name to what its value must be, and whether it has to be there
+
+
+def read_toml(path: Path) -> tuple[dict[str, Any], str]:
+    """Return what a TOML file holds, and its text.
+
+    Raises:
+        InputError: it cannot be read, or is not TOML.
+    """
+    try:
+        text = path.read_text(encoding="utf-8")
+        return tomllib.loads(text), text
+    except OSError as error:
+        raise InputError(f"cannot read '{path}': {error.strerror or error}") from error
+    except (ValueError, RecursionError) as error:  # not UTF-8, a number of thousands of digits, tables without end
+        raise InputError(f"'{path}' is not TOML: {error}") from error
 
 
 def check_keys(values: Mapping[str, Any], keys: Keys, place: str) -> None:
@@ -45,7 +65,7 @@ def check_keys(values: Mapping[str, Any], keys: Keys, place: str) -> None:
 
 def _fits(value: Any, kind: str) -> bool:
     def number(x: Any) -> bool:
-        return isinstance(x, int | float) and not isinstance(x, bool)
+        return isinstance(x, int | float) and not isinstance(x, bool) and abs(x) <= LARGEST  # so neither NaN nor inf
 
     if kind == NUMBER:
         return number(value)

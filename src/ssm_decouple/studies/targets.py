@@ -14,18 +14,21 @@ from ssm_decouple.batch import Batch
 from ssm_decouple.batch.results import Motions
 from ssm_decouple.batch.rows import move_poses, place_points
 from ssm_decouple.control.law import SelectiveLaw
-from ssm_decouple.errors import InputError, as_floats, as_seed
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.errors import InputError, as_floats, as_kind, as_number, as_seed, as_whole, shown
+from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum.protection import AXES, Protection
-from ssm_decouple.studies.case import Case
+from ssm_decouple.settled import Settled, fixed
+from ssm_decouple.studies.case import Case, checked_case
 from ssm_decouple.studies.comparison import UNDAMPED, laws_of
 from ssm_decouple.studies.postures import MARGIN, PROTECTIONS, joint_ranges
 from ssm_decouple.studies.shares import CONFIDENCE, wilson
 
 Floats = NDArray[np.float64]
+
 Flags = NDArray[np.bool_]
 Triple = tuple[float, float, float]
 
+MOST_TARGETS = 10**6
 COUNT = 10_000
 DRAWN = 8192  # random starts that are looked at together
 TRIES = 64  # so many times before there seem to be none
@@ -74,6 +77,8 @@ def random_starts(robot: Robot, count: int, seed: int = 0, margin: float = MARGI
         InputError: a count or a seed that makes no sense, or hardly any such configurations.
     """
     _check_count(count)
+    checked_robot(robot)
+    margin = as_number("margin", margin, "it needs a number, m")
     engine, (low, high) = Batch(robot), joint_ranges(robot).T
     random = np.random.default_rng([as_seed("seed", seed), 1])
     found: list[Floats] = []
@@ -106,6 +111,7 @@ def random_targets(robot: Robot, starts: ArrayLike, count: int, seed: int = 0, n
         InputError: a count or a seed that makes no sense, or starts of another shape.
     """
     _check_count(count)
+    checked_robot(robot)
     given = np.atleast_2d(as_floats("starts", starts))
     if given.ndim != 2 or given.shape[1] != robot.model.nq or len(given) not in (1, count):
         raise InputError(
@@ -137,6 +143,9 @@ def end_of_path(robot: Robot, configurations: Floats, goals: Floats, intervals: 
     """
     engine = Batch(robot)
     joints, poses = engine.split(configurations)
+    goals, intervals = as_floats("goals", goals), as_whole("intervals", intervals, most=MOST_TARGETS)
+    if goals.shape != joints.shape:
+        raise InputError(f"goals have shape {goals.shape}; {len(joints)} configurations need {joints.shape}")
     way, h = goals - joints, 1.0 / intervals
     for i in range(intervals):
         first, second = (_twists(engine, joints + (i + node) * h * way, h * way) for node in _GAUSS)
@@ -284,7 +293,7 @@ class Stop:
 
 
 @dataclass
-class Trials:
+class Trials(Settled):
     """The same targets under several laws; what is done stays when it is interrupted.
 
     Attributes:
@@ -311,6 +320,8 @@ class Trials:
         Raises:
             InputError: no laws, or one that the engine refuses; the message says why.
         """
+        as_kind("targets", self.targets, Targets, "draw some with random_targets(..)")
+        self.laws = fixed(as_kind("laws", self.laws, Mapping, "give laws by name"))  # type: ignore[type-abstract]
         if not self.laws:
             raise InputError("there are no laws to try; give at least one, such as {'none': SelectiveLaw(..)}")
         for name, law in self.laws.items():
@@ -484,6 +495,7 @@ def case_trials(
     Raises:
         InputError: the batch engine does not do what the case asks for; the message says what.
     """
+    checked_case(case)
     try:
         beyond = [key for key in case.simulation if key not in ("method", "arrival_tolerance")]
         if beyond or case.simulation.get("method", "explicit") != "explicit":
@@ -566,5 +578,9 @@ def _percentiles(values: Floats, share: float) -> Triple | None:
 
 
 def _check_count(count: int) -> None:
-    if not isinstance(count, int) or isinstance(count, bool) or count < 1:
-        raise InputError(f"{count!r} targets are no study; give a whole number from 1")
+    try:
+        as_whole("count", count, most=MOST_TARGETS)
+    except InputError:
+        raise InputError(
+            f"{shown(count)} targets are no study; give a whole number from 1 to {MOST_TARGETS:,}"
+        ) from None

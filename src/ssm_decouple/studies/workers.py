@@ -20,9 +20,10 @@ from multiprocessing.connection import Connection, wait
 from types import FrameType
 from typing import Any, Protocol
 
-from ssm_decouple.errors import DecoupleError, FileError, InputError
+from ssm_decouple.errors import DecoupleError, FileError, InputError, as_whole
 from ssm_decouple.studies.campaign import Campaign, Rows, versions
 
+MOST_WORKERS = 1024
 ATTEMPTS = 3  # workers that a chunk may cost
 AHEAD = 2  # chunks that a worker of this machine has at a time, so that it need not wait for the next
 IN_FLIGHT = 4  # likewise, for each thread of a cluster
@@ -66,6 +67,7 @@ def pool_of(campaign: Campaign, workers: int, scheduler: str | None, note: Note)
         return cluster
     if workers < 1:
         raise InputError(f"workers is {workers}; give at least 1")
+    as_whole("workers", workers, 1, "", MOST_WORKERS)
     return Here(campaign) if workers == 1 else Processes(campaign, workers, note)
 
 

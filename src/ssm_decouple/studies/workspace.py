@@ -17,15 +17,17 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import qmc, t
 
 from ssm_decouple.batch.engine import Batch
-from ssm_decouple.errors import InputError, as_positive, as_seed
-from ssm_decouple.model.robot import Robot
+from ssm_decouple.errors import InputError, as_floats, as_items, as_positive, as_seed, as_whole, shown
+from ssm_decouple.model.robot import Robot, checked_robot
 from ssm_decouple.momentum.protection import Protection
+from ssm_decouple.settled import Settled, fixed_array
 from ssm_decouple.studies.postures import MARGIN, PROTECTIONS, joint_ranges
 from ssm_decouple.studies.shares import CONFIDENCE, wilson
 
@@ -38,6 +40,8 @@ BLOCKS = 16  # independent scrambles
 CHUNK = 2**16  # postures at a time
 CLIMBS = 4  # searched postures to a drawn one
 VOXELS = 2**18  # more are refused: every one keeps a posture for each protection
+MOST_SAMPLES = 10**9  # postures, and four times as many that are searched: weeks
+MOST_POINTS = 2000  # of each joint of a slice
 PER_REACH = 20.0  # voxels to a reach
 CURVE = np.geomspace(1e-6, 10.0, 141)  # m: where the distribution of sigma is counted, 20 to a decade
 
@@ -106,10 +110,13 @@ class Grid:
         """Return cubes of a size, reach / 20 if none is given, with the arm's first joint in the middle of one.
 
         Raises:
-            InputError: the size is not positive, or so small that there are more than `VOXELS` cubes.
+            InputError: the size is not positive, or so small that there are more than `VOXELS` cubes; or the arm's
+                reach has no end.
         """
+        if not np.isfinite(checked_robot(robot).reach):
+            raise InputError(f"'{robot.name}' reaches without end: a joint slides without limits; give it limits")
         size = as_positive("voxel", robot.reach / PER_REACH if edge is None else edge)
-        half = int(np.ceil(robot.reach / size))
+        half = int(np.ceil(min(robot.reach / size, float(VOXELS))))
         count = 2 * half + 1
         if count**3 > VOXELS:
             least = 1.01 * robot.reach / ((round(VOXELS ** (1 / 3)) - 1) // 2)
@@ -194,7 +201,7 @@ class Elites:
 
 
 @dataclass
-class Workspace:
+class Workspace(Settled):
     """Which postures and places of one robot protections leave fit for work; what is done stays when interrupted.
 
     Postures are drawn uniformly within `joint_ranges`, by `BLOCKS` independently scrambled Sobol sequences; after each
@@ -219,6 +226,8 @@ class Workspace:
         elites: The best postures so far.
     """
 
+    _assignable: ClassVar[tuple[str, ...]] = ("drawn", "elites")
+
     robot: Robot
     margin: float = MARGIN
     samples: int = SAMPLES
@@ -241,19 +250,20 @@ class Workspace:
             InputError: fewer than three joints, a joint without a range, a margin that is not positive, no samples, a
                 seed that is none, or a voxel size that makes no sense.
         """
-        if self.robot.n_joints < 3:
+        if checked_robot(self.robot).n_joints < 3:
             raise InputError(
                 f"'{self.robot.name}' has {self.robot.n_joints} joints, but a position takes three freedoms; give a "
                 "robot with three joints or more"
             )
         self.margin = as_positive("margin", self.margin)
-        as_seed("seed", self.seed)
-        if not isinstance(self.samples, int) or isinstance(self.samples, bool) or self.samples < 1:
-            raise InputError(f"samples is {self.samples!r}; give a positive whole number, such as {SAMPLES}")
+        self.seed = as_seed("seed", self.seed)
+        needs = f"give a positive whole number, such as {SAMPLES}"
+        self.samples = as_whole("samples", self.samples, 1, needs, MOST_SAMPLES)
+        self.protections = tuple(as_items("protections", self.protections, "give a list, such as ['none', 'yaw']"))
         self._ranges = joint_ranges(self.robot)
         self.grid = Grid.about(self.robot, self.voxel)
         self.margins = tuple(sorted({*MARGINS, self.margin}))
-        self.edges = np.union1d(CURVE, self.margins)
+        self.edges = fixed_array(np.union1d(CURVE, self.margins))
         self._parsed = [Protection.parse(text) for text in self.protections]
         self._engine = Batch(self.robot, threads=self.threads)
         self._size = 2 ** max(0, round(np.log2(self.samples / BLOCKS)))  # of a block
@@ -432,19 +442,27 @@ def joint_slice(
     Raises:
         InputError: no such joint, or one without a range.
     """
-    i, j = (robot.joint_index(name) for name in joints)
+    two = as_items("joints", joints, "give the names of two")
+    if len(two) != 2:
+        raise InputError(f"joints is {shown(joints)}; give the names of two")
+    i, j = (checked_robot(robot).joint_index(name) for name in two)
+    points = as_whole("points", points, 2, most=MOST_POINTS)
+    protections = as_items("protections", protections, "give a list, such as ['none', 'yaw']")
+    posture = as_floats("posture", posture)
+    if posture.shape != (robot.n_joints,) or not np.all(np.isfinite(posture)):
+        raise InputError(f"posture is {shown(posture.tolist())}; it needs {robot.n_joints} finite numbers, one a joint")
     ranges = joint_ranges(robot)
     first, second = (np.linspace(low, high, points) for low, high in ranges[[i, j]])
-    rows = np.tile(np.asarray(posture, dtype=float), (points * points, 1))
+    rows = np.tile(posture, (points * points, 1))
     rows[:, i], rows[:, j] = np.repeat(first, points), np.tile(second, points)
     sigma = Batch(robot).singular_values(rows, [Protection.parse(text) for text in protections])
     shaped = sigma.T.reshape(len(protections), points, points)
-    return JointSlice(joints, np.array(posture, dtype=float), (first, second), tuple(protections), shaped)
+    return JointSlice(joints, posture, (first, second), tuple(protections), shaped)
 
 
 def arm_joints(robot: Robot) -> list[str]:
     """Return the names of the joints from the base to the end-effector, then those of all others."""
-    chain = robot.model.supports[robot.model.frames[robot.end_effector_id].parentJoint]
+    chain = checked_robot(robot).model.supports[robot.model.frames[robot.end_effector_id].parentJoint]
     names = [robot.joint_names[joint - 2] for joint in chain if joint > 1]
     return [*names, *(name for name in robot.joint_names if name not in names)]
 
@@ -465,6 +483,9 @@ def interval(shares: Floats, samples: int, confidence: float = CONFIDENCE) -> tu
     Returns:
         Lower and upper end, within 0 and 1.
     """
+    shares, samples = as_floats("shares", shares), as_whole("samples", samples)
+    if shares.ndim != 1 or not shares.size or not np.all((shares >= 0.0) & (shares <= 1.0)):
+        raise InputError(f"shares are {shown(shares.tolist())}; they need numbers from 0 to 1, one a block")
     mean, spread = float(np.mean(shares)), float(np.std(shares, ddof=1)) if len(shares) > 1 else 0.0
     if spread == 0.0:
         return wilson(round(mean * samples), samples, confidence)

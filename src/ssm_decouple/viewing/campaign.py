@@ -52,7 +52,11 @@ def campaign_sheet(store: Store) -> Figure:
     grid[-1, 0].set_xlabel("share of the samples,\n95 % interval of arrivals")
     grid[-1, 1].set_xlabel("distance left at the end (mm)")
     grid[-1, 2].set_xlabel("base rotation, peak to peak,\nwhere it arrives (deg)")
-    figure.suptitle(f"{status.title}\n{status.done:,} of {status.samples:,} samples", fontsize=9)
+    absent = [
+        f"{case}, {word}" for case in status.cases for word in status.protections if not _is_in(cases, case, word)
+    ]
+    told = f"\nno sample yet of {'; '.join(absent)}" if absent else ""
+    figure.suptitle(f"{status.title}\n{status.done:,} of {status.samples:,} samples{told}", fontsize=9)
     figure.legend(*_legend(grid[:, 0]), ncols=4, loc="outside lower left")
     figure.legend(*_legend(grid[:, 1]), ncols=4, loc="outside lower right")
     return figure
@@ -75,6 +79,10 @@ def combinations(store: Store) -> Combinations:
     if not found:
         raise InputError(f"no sample is in {store.path} yet; 'campaign run' with --resume goes on")
     return found
+
+
+def _is_in(found: Combinations, case: str, word: str) -> bool:
+    return WORDS.get(word, word) in found.get(case, {})
 
 
 def _draw_ends(axes: Axes, found: Mapping[str, xr.Dataset]) -> None:

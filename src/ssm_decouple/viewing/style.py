@@ -16,11 +16,18 @@ from ssm_decouple.files import writable_folder, written_whole
 
 T = TypeVar("T")
 
+ROOM = 300.0  # below the floor of a logarithmic axis, for the words about it
 COLUMN = 3.45  # inches, one column of a two-column page
 PAGE = 7.1
 
 # Okabe and Ito's palette, which readers with any colour vision tell apart.
 AXIS_COLORS = {"roll": "#D55E00", "pitch": "#009E73", "yaw": "#0072B2"}
+# The first is the widest, so that each is seen where all three lie on top of each other.
+AXIS_LINES: dict[str, dict[str, Any]] = {
+    "roll": {"color": AXIS_COLORS["roll"], "linewidth": 2.2},
+    "pitch": {"color": AXIS_COLORS["pitch"], "linewidth": 1.3},
+    "yaw": {"color": AXIS_COLORS["yaw"], "linewidth": 0.9, "linestyle": (0, (4, 1.5))},
+}
 PROTECTED = "#CC79A7"
 TARGET = "#000000"
 LAW_LINES: dict[str, dict[str, Any]] = {
@@ -82,6 +89,54 @@ def panels(rows: int, columns: int = 1, width: float = COLUMN, height: float = 1
     figure = Figure(figsize=(width, height * rows + 0.25))
     axes = figure.subplots(rows, columns, sharex=True, squeeze=False)
     return figure, list(axes.flat)
+
+
+def floored(axes: Axes, x: Any, values: Any, floor: float, unit: str, **line: Any) -> None:
+    """Draw values on a logarithmic axis, those at or below a floor on it: with marks, and a line that says what it is.
+
+    Args:
+        axes: The panel.
+        x: (m,).
+        values: (m,), not negative; zeros have no place on such an axis.
+        floor: The least that is told apart from zero.
+        unit: Of the values.
+        line: As for `plot`.
+    """
+    given = np.asarray(values, dtype=float)
+    low = np.flatnonzero(given <= floor)
+    # A mark on each of a thousand samples would be a bar.
+    marked: dict[str, Any] = {"marker": "v", "markersize": 2.5, "markevery": low[:: 1 + len(low) // 40].tolist()}
+    axes.semilogy(x, np.maximum(given, floor), **line, **(marked if low.size else {}))
+    if low.size:
+        tell_floor(axes, floor, unit)
+
+
+def tell_floor(axes: Axes, floor: float, unit: str) -> None:
+    """Draw the line of a logarithmic axis on which zeros stand, and say what it is."""
+    told = f"{floor:g} {unit} or less: zero or rounding"
+    if told in [text.get_text() for text in axes.texts]:
+        return
+    across = axes.get_yaxis_transform()
+    axes.hlines(floor, 0.0, 1.0, color="#8C8C8C", linewidth=0.5, linestyle=(0, (1, 1.5)), transform=across)
+    place: dict[str, Any] = {"textcoords": "offset points", "ha": "right", "va": "top", "xycoords": across}
+    axes.annotate(told, (0.99, floor), (0.0, -2.5), fontsize=5.5, color="#444444", **place)
+    axes.update_datalim([(axes.dataLim.x1, floor / ROOM)], updatex=False)
+    axes.autoscale_view(scalex=False)
+
+
+def tell_gaps(figure: Figure) -> None:
+    """Say in each panel where a line has a gap because its values are no numbers, and mark lines of one sample."""
+    for axes in figure.axes:
+        gaps = 0
+        for drawn in axes.lines:
+            values = np.asarray(drawn.get_ydata(), dtype=float)
+            gaps = max(gaps, int(np.sum(~np.isfinite(values))))
+            if len(values) == 1:
+                drawn.set_marker("o")
+                drawn.set_markersize(2.5)
+        if gaps:
+            words = f"not a number at {gaps} of the samples"
+            axes.text(0.01, 0.02, words, transform=axes.transAxes, fontsize=5.5, color="#D55E00")
 
 
 def save(figure: Figure, folder: str | Path, name: str) -> list[Path]:

@@ -167,7 +167,13 @@ def saturation(row: Summary) -> str | None:
     listed = ", ".join(f"{start:.1f} to {end:.1f} s" for start, end in row.saturated[:3])
     more = f" and {len(row.saturated) - 3} times more" if row.saturated[3:] else ""
     drives = f"{row.case}, {row.law}: drives at their torque limits for {total:.1f} s: {listed}{more}."
+    drives += f" {row.limited_drives}." if row.limited_drives else ""
     return drives if wheels is None else f"{drives} {wheels}"
+
+
+def not_kept(row: Summary) -> str | None:
+    """Say what was promised and not kept; None if all was."""
+    return f"{row.case}, {row.law}: {row.told}." if row.told else None
 
 
 def explain(row: Summary) -> str | None:

@@ -191,6 +191,10 @@ def draw_shares(axes: Axes, values: dict[str, Floats], floor: float) -> None:
         axes.step(rising, np.arange(1, len(each) + 1) / len(each), where="post", label=name, **line)
     axes.set(xscale="log", ylim=(-0.02, 1.02))
     axes.xaxis.set_minor_locator(NullLocator())
+    below = any(np.any(each <= floor) for each in values.values())
+    if below:
+        told = f"{floor:g} or less"
+        axes.text(floor, 1.0, told, rotation=90, ha="right", va="top", fontsize=5.5, color="#666666")
 
 
 def _draw_where_all_arrive(axes: Axes, trials: Trials) -> None:
@@ -204,9 +208,14 @@ def _draw_where_all_arrive(axes: Axes, trials: Trials) -> None:
 
 def draw_rotations(axes: Axes, turned: dict[str, Floats]) -> None:
     """Draw roll, pitch and yaw (m, 3), rad, of each law's motions: 5th to 95th percentile, quartiles, median."""
+    largest = 0.0
     for i, (j, (name, angles)) in product(range(3), enumerate(turned.items())):
         values = np.maximum(np.rad2deg(angles[:, i]), FLOOR_DEG)
-        if len(values):
+        if not len(values):
+            place = -i - 0.17 * (j - 0.5 * (len(turned) - 1))
+            axes.text(FLOOR_DEG, place, f"{name}: none arrives", va="center", fontsize=5, color="#666666")
+        else:
+            largest = max(largest, float(np.percentile(values, 95)))
             low, first, middle, third, high = np.percentile(values, [5, 25, 50, 75, 95])
             place = -i - 0.17 * (j - 0.5 * (len(turned) - 1))
             color = LAW_LINES.get(name, {}).get("color")
@@ -214,9 +223,7 @@ def draw_rotations(axes: Axes, turned: dict[str, Floats]) -> None:
             axes.plot([first, third], [place, place], color=color, linewidth=3.0, solid_capstyle="butt")
             edge = color if middle <= FLOOR_DEG else "black"
             axes.plot([middle], [place], color=edge, marker="|", markersize=5, markeredgewidth=0.9, clip_on=False)
-    axes.set(xscale="log", xlim=(0.7 * FLOOR_DEG, 30.0))
-    axes.set_xticks(*DEGREES)
-    axes.xaxis.set_minor_locator(NullLocator())
+    _set_degrees(axes, 30.0, largest)
     axes.set_yticks([0, -1, -2], list(AXIS_COLORS))
     axes.set_ylim(-2.6, 0.6)
 
@@ -232,7 +239,8 @@ def distances(studies: Sequence[Trials]) -> Figure:
         draw_shares(axes, {name: 1e3 * trials.found[name].final_error for name in trials.found}, FLOOR_MM)
         axes.axvline(1e3 * trials.arrival_tolerance, color="black", linewidth=0.5, linestyle=":")
         shares = " / ".join(f"{100 * trials.arrived(name).mean():.1f}" for name in trials.found)
-        axes.set(title=f"{trials.targets.start}\n{shares} % arrive", xlim=(FLOOR_MM, 6e3))
+        farthest = max(6e3, *(1.1e3 * np.nanmax(found.final_error, initial=0.0) for found in trials.found.values()))
+        axes.set(title=f"{trials.targets.start}\n{shares} % arrive", xlim=(FLOOR_MM, farthest))
     for axes in grid[:, 0]:
         axes.set_ylabel("share of the targets")
     for axes in grid[-1]:
@@ -294,6 +302,7 @@ def _draw_ends(axes: Axes, trials: Trials) -> None:
 
 def _draw_medians(axes: Axes, trials: Trials) -> None:
     """Draw the medians of the base's angles under each law, where it arrives."""
+    largest = 0.0
     for i, (axis, color) in enumerate(AXIS_COLORS.items()):
         turned = [np.rad2deg(found.base_rotation[trials.arrived(name), i]) for name, found in trials.found.items()]
         medians = [np.median(values) if len(values) else np.nan for values in turned]
@@ -305,6 +314,19 @@ def _draw_medians(axes: Axes, trials: Trials) -> None:
             "linestyle": "none",
         }
         axes.plot(np.maximum(medians, FLOOR_DEG), places, label=axis, **mark)
-    axes.set(xscale="log", xlim=(0.7 * FLOOR_DEG, 10.0))
-    axes.set_xticks(*DEGREES)
+        largest = max(largest, *np.nan_to_num(medians))
+        for place, middle in zip(places, medians, strict=True):
+            if np.isnan(middle) and i == 0:
+                axes.text(FLOOR_DEG, place, "none arrives", va="center", fontsize=5.5, color="#666666")
+    _set_degrees(axes, 10.0, largest)
+
+
+def _set_degrees(axes: Axes, usual: float, largest: float) -> None:
+    """Set the axis of base rotations, deg, so that none is beyond its end."""
+    ticks, labels = list(DEGREES[0]), list(DEGREES[1])
+    if largest > usual:
+        ticks, labels = [*ticks, 100.0, 360.0], [*labels, "100", "360"]
+    axes.set_xscale("log")
+    axes.set_xticks(ticks, labels)
+    axes.set_xlim(0.7 * FLOOR_DEG, usual if largest <= usual else 500.0)
     axes.xaxis.set_minor_locator(NullLocator())

@@ -43,10 +43,11 @@ def slices(study: Workspace) -> Figure:
     figure = Figure(figsize=(PAGE, 3.75))
     axes = figure.subplots(2, len(shown), sharex=True, sharey=True, squeeze=False)
     x, z, layer = grid.edges(0), grid.edges(2), grid.shape[1] // 2
+    top_value = max(1.0, *(float(np.nanmax(study.best(name)[:, layer], initial=0.0)) for name in shown))
     for column, protection in enumerate(shown):
         top, bottom = axes[:, column]
         best = np.maximum(study.best(protection)[:, layer], FLOOR).T
-        sigma = top.pcolormesh(x, z, best, cmap="viridis", norm=LogNorm(FLOOR, 1.0), rasterized=True)
+        sigma = top.pcolormesh(x, z, best, cmap="viridis", norm=LogNorm(FLOOR, top_value), rasterized=True)
         top.contour(_middles(x), _middles(z), best, levels=[study.margin], colors="white", linewidths=0.7)
         share = study.fit_share(protection)[:, layer].T
         fit = bottom.pcolormesh(x, z, 100 * share, cmap="cividis", vmin=0, vmax=100, rasterized=True)
@@ -104,12 +105,14 @@ def distributions(studies: Sequence[Workspace]) -> Figure:
     axes = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False)
     for panel in axes.flat[len(studies) :]:
         panel.set_axis_off()
+    reached = [study.edges[study.above(name) > 0].max(initial=0.0) for study in studies for name in study.protections]
+    widest = max(1.5, *reached)
     for panel, study in zip(axes.flat, studies, strict=False):
         for protection in study.protections:
             line = _LINES.get(protection, {})
             panel.semilogx(study.edges, 100 * study.above(protection), label=_title(protection), **line)
         panel.axvline(study.margin, color="black", linewidth=0.5, linestyle=":")
-        panel.set(xlim=(1e-4, 1.5), ylim=(0, 101), title=study.robot.name)
+        panel.set(xlim=(1e-4, widest), ylim=(0, 101), title=study.robot.name)
         panel.set_xticks([1e-4, 1e-3, 1e-2, 1e-1, 1])
     for panel in axes.flat[max(0, len(studies) - columns) : len(studies)]:
         panel.set_xlabel(r"margin on the smallest $\sigma$ (m)")
@@ -130,9 +133,12 @@ def joint_plane(subject: tuple[Robot, JointSlice, float, str]) -> Figure:
     panels = figure.subplots(1, len(shown), sharex=True, sharey=True, squeeze=False)[0]
     units = [1.0 if _slides(robot, name) else np.rad2deg(1.0) for name in cut.joints]
     x, y = (unit * angles for unit, angles in zip(units, cut.angles, strict=True))
+    top_value = max(1.0, float(np.max(cut.sigma)))
     for panel, protection in zip(panels, shown, strict=True):
         sigma = np.maximum(cut.sigma[cut.protections.index(protection)].T, FLOOR)
-        map_ = panel.pcolormesh(x, y, sigma, cmap="viridis", norm=LogNorm(FLOOR, 1.0), shading="auto", rasterized=True)
+        map_ = panel.pcolormesh(
+            x, y, sigma, cmap="viridis", norm=LogNorm(FLOOR, top_value), shading="auto", rasterized=True
+        )
         if sigma.min() < margin < sigma.max():
             panel.contour(x, y, sigma, levels=[margin], colors="white", linewidths=0.6)
         panel.set_title(f"{_title(protection)}: {100 * np.mean(sigma > margin):.0f} %")

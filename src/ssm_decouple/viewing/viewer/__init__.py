@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 
 import xarray as xr
 
-from ssm_decouple.errors import InputError
+from ssm_decouple.errors import InputError, as_items
 from ssm_decouple.viewing.viewer.server import HOST, PORT, require_viser
 
 if TYPE_CHECKING:
@@ -60,7 +60,8 @@ def scenes_of(motions: Motions, mesh_folders: Sequence[str | Path] = ()) -> list
 
     if isinstance(motions, xr.Dataset):
         motions = [motions]
-    named = motions.items() if isinstance(motions, Mapping) else enumerate(motions)
+    mend = "give one or several motions, as simulate(..) returns them"
+    named = motions.items() if isinstance(motions, Mapping) else enumerate(as_items("motions", motions, mend))
     pairs: list[tuple[object, xr.Dataset]] = list(named)  # type: ignore[arg-type]
     if not pairs:
         raise InputError("there is no motion to show; give one, as simulate(..) returns it")

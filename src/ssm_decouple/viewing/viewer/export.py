@@ -37,6 +37,7 @@ Progress = Callable[[float], object]
 SPEED = 10.0
 HTML_FRAMES = 20  # a second
 AHEAD = 0.03  # s: poses and the wish for a picture take two ways to the browser, and poses have to be there first
+MOST_PICTURES = 100_000  # of a film: more than an hour of it
 GIF_FRAMES = 12  # a second: more makes a file that nobody sends
 _DARK, _LIGHT = (14, 17, 24), (255, 255, 255)
 
@@ -189,7 +190,13 @@ def write_film(
 
 
 def _times(end: float, speed: float, rate: int) -> Floats:
-    count = max(2, round(end / speed * rate) + 1)
+    length = end / speed * rate
+    if length > MOST_PICTURES:
+        raise InputError(
+            f"a film of {length:.3g} pictures, {MOST_PICTURES:,} at most: use a speed of "
+            f"{end * rate / MOST_PICTURES:.3g} or more, or fewer pictures a second"
+        )
+    count = max(2, round(length) + 1)
     return np.linspace(0.0, end, count)
 
 
@@ -265,7 +272,13 @@ def _captioned(
         y = round(3 * unit + (i + 0.5) * room - 3.6 * unit)
         draw.rectangle((unit, y + 0.15 * unit, 1.7 * unit, y + 0.85 * unit), color)
         draw.text((2.2 * unit, y), scene.name, ink, bold)
-        lines = [status(scene, now), f"left {left} mm", f"turned {turned} deg", f"|w_sub| {protected} rad/s"]
+        of_left = " mm" if scene.distance_unit == "mm" else ""  # others stand with the number
+        lines = [
+            status(scene, now),
+            f"left {left}{of_left}",
+            f"turned {turned} deg",
+            f"|w_sub| {protected} rad/s",
+        ]
         if scene.protected_rate is None:
             lines[-1] = "nothing protected"
         lines.append(f"momentum {momentum}" + (" N m s" if scene.has_momentum else ""))

@@ -23,11 +23,11 @@ from ssm_decouple.control.task import PoseTask, PositionTask
 from ssm_decouple.errors import InputError
 from ssm_decouple.model.catalogue import models
 from ssm_decouple.momentum.protection import Protection
-from ssm_decouple.simulation.motion import judge
+from ssm_decouple.simulation.motion import judge, twist_along
 from ssm_decouple.studies.case import Case, cases, load_case
-from ssm_decouple.viewing.viewer.page import Page
-from ssm_decouple.viewing.viewer.parts import Part, antenna, spacecraft_parts
-from ssm_decouple.viewing.viewer.plots import AXES, FLOOR, HEIGHT, POINTS, caption
+from ssm_decouple.viewing.viewer.page import Page, chosen_pace, one_of
+from ssm_decouple.viewing.viewer.parts import Part, antenna, drawn_reach, spacecraft_parts
+from ssm_decouple.viewing.viewer.plots import AXES, FLOOR, FLOORED, HEIGHT, POINTS, caption
 from ssm_decouple.viewing.viewer.scene import Vectors, body_poses, rotated, split_rate
 from ssm_decouple.viewing.viewer.server import HOST, PORT
 from ssm_decouple.viewing.viewer.shapes import (
@@ -53,7 +53,9 @@ TRAIL = 300
 USUAL = 0.2  # of the base rate that one joint causes at its limit: the longest arrow, until there has been more
 QUIET = 1e-7  # rad/s: slower joints are at rest on a page
 FOLLOWED = 60.0  # s: what the plots show
-_PLOTS = (("left (mm), the last minute", "#56B4E9"), ("|w_sub| (10^x rad/s), the last minute", "#CC79A7"))
+FARTHEST = 1e9  # m: no target is dragged farther
+FASTEST = 1e9  # m/s, rad/s: what is faster, or no number, is no motion
+_PLOTS = (("left (mm), the last minute", "#56B4E9"), (f"|w_sub| (10^x rad/s{FLOORED}), the last minute", "#CC79A7"))
 
 
 @dataclass
@@ -71,7 +73,8 @@ class Live(Page):
     """A case or a robot whose target is dragged in the browser. It runs until it is stopped.
 
     The law is asked each `dt` of its own, and at once when the target or the protection changes; in between its joint
-    rates are held. A law that plans for a hold is asked at the end of each hold alone.
+    rates are held. A law that plans for a hold is asked at the end of each hold alone. Where the law cannot be asked,
+    because it raises or says what is no number, the arm stands still and the page says why, until it can.
 
     Args:
         case: The case.
@@ -111,6 +114,7 @@ class Live(Page):
         self.frames = 0
         self._data = self.robot.model.createData()
         self._asked: float | None = None
+        self._in_vain = False  # whether the law could not be asked the last time
         self._lock, self._told = threading.RLock(), 0.0
         super().__init__(host, port)
         self._add_spacecraft(spacecraft_parts(self.robot, case.turned, mesh_folders))
@@ -136,13 +140,25 @@ class Live(Page):
         Args:
             position: (3,), m, inertial axes.
             wxyz: Orientation (4,), where the case asks for one.
+
+        Raises:
+            InputError: they are not finite numbers, too far, or the orientation is none; the target stays where it is.
         """
+        place = _finite("position of the target", position, 3)
+        if np.abs(place).max() > FARTHEST:
+            raise InputError(f"the target is {np.abs(place).max():.3g} m away; {FARTHEST:g} m is the farthest")
+        turn = None
+        if self.posed and wxyz is not None:
+            given = _finite("orientation of the target", wxyz, 4)
+            length = float(np.linalg.norm(given))
+            if length < 1e-6:
+                raise InputError(f"the orientation of the target is {given.tolist()}; a quaternion w x y z is no zero")
+            turn = pin.Quaternion(*map(float, given / length)).toRotationMatrix()
         with self._lock:
             if self.posed:
-                turn = self.target.rotation if wxyz is None else pin.Quaternion(*map(float, wxyz)).toRotationMatrix()
-                self.target = pin.SE3(turn, np.array(position, dtype=float))
+                self.target = pin.SE3(self.target.rotation if turn is None else turn, place)
             else:
-                self.target = np.array(position, dtype=float)
+                self.target = place
             self._asked = time.perf_counter() if self._asked is None else self._asked
             self.past.changed = self.clock
         self._wake.set()
@@ -154,7 +170,7 @@ class Live(Page):
             name: One of `laws`, or what `Protection.parse` reads, such as "pitch" or "0.6,0,0.8": a law is made of it.
 
         Raises:
-            InputError: it is neither, or no law can protect it.
+            InputError: it is neither, or no law can protect it; the protection stays what it is.
         """
         with self._lock:
             if name not in self.laws:
@@ -166,17 +182,31 @@ class Live(Page):
         self._wake.set()
 
     def _on_own(self, event: viser.GuiEvent[Any]) -> None:
+        self.protect(self.own.value.strip())
+
+    def _on_handle(self, event: viser.TransformControlsEvent) -> None:
         try:
-            self.protect(self.own.value.strip())
-        except InputError as error:
-            if event.client is not None:
-                event.client.add_notification("not protected", str(error), color="red")
+            self.drag(self.handle.position, self.handle.wxyz)
+        except InputError:
+            self.handle.position = self.target.translation if self.posed else self.target
+            if self.posed:
+                self.handle.wxyz = pin.Quaternion(self.target.rotation).coeffs()[[3, 0, 1, 2]]
+            raise
+
+    def _on_protection(self, event: viser.GuiEvent[Any]) -> None:
+        if event.client is None:  # the page's own doing
+            return
+        try:
+            self.protect(one_of(self.protection))
+        except Exception:
+            self.protection.value = self.chosen  # type: ignore[misc]  # viser's setter stands in a class between
+            raise
 
     def restart(self) -> None:
         """Put the spacecraft back where the case starts."""
         with self._lock:
             self.q, self.clock, self.held, self.past = self.case.start(), 0.0, 0.0, _Past()
-            self.values[:] = 0.0
+            self.values = np.zeros(self.law.size)
         self._wake.set()
 
     def _add_spacecraft(self, parts: list[Part]) -> None:
@@ -186,7 +216,7 @@ class Live(Page):
         for i, part in enumerate(parts):
             body = self.joints.index(part.joint)
             add_part(self.server, f"/spacecraft/body_{body}/{part.name or 'part'}_{i}", part)
-        self.size = max(2.0 * self.robot.reach, _width(parts))
+        self.size = max(2.0 * drawn_reach(self.robot), _width(parts))
         found = antenna(parts)
         if found is not None:
             line, name = sight_line(found[1], self.size), "/spacecraft/body_0/line_of_sight"
@@ -194,7 +224,7 @@ class Live(Page):
         self.arrows = Arrows(self.server, "/spacecraft", self.size, parts)
         self._largest = USUAL * self._fastest_joint()
         self._protected: str | None = None
-        reach, place = self.robot.reach, self.robot.shoulder_position(q)
+        reach, place = drawn_reach(self.robot), self.robot.shoulder_position(q)
         start = self.target.translation if self.posed else self.target
         self.handle = scene.add_transform_controls(
             "/target",
@@ -205,7 +235,7 @@ class Live(Page):
             position=start,
             wxyz=pin.Quaternion(self.target.rotation).coeffs()[[3, 0, 1, 2]] if self.posed else (1.0, 0.0, 0.0, 0.0),
         )
-        self.handle.on_update(lambda _: self.drag(self.handle.position, self.handle.wxyz))
+        self.handle.on_update(self._heeding(self._on_handle))
         scene.add_icosphere("/target/ball", radius=0.035 * reach, color=TARGET)
         self.trail = Trail(self.server, "/trail", TRAIL, PATH, 0.004 * reach)
         self.gap = Trail(self.server, "/gap", 2, FAINT, 0.002 * reach)
@@ -232,10 +262,10 @@ class Live(Page):
         self.state = gui.add_html(self._state())
         gui.add_html(LEGEND)
         self._add_plots()
-        self.protection.on_update(lambda event: self.protect(self.protection.value) if event.client else None)
-        own.on_click(self._on_own)
-        self.speed.on_update(lambda _: setattr(self, "pace", float(self.speed.value.split()[0])))
-        back.on_click(lambda _: self.restart())
+        self.protection.on_update(self._heeding(self._on_protection, "not protected"))
+        own.on_click(self._heeding(self._on_own, "not protected"))
+        self.speed.on_update(self._heeding(lambda _: setattr(self, "pace", chosen_pace(self.speed))))
+        back.on_click(self._heeding(lambda _: self.restart()))
 
     def _fastest_joint(self) -> float:
         """Return the fastest, rad/s, that one joint alone turns the base at the start."""
@@ -246,15 +276,21 @@ class Live(Page):
         self.advance(min(elapsed, 0.25))
 
     def advance(self, elapsed: float) -> None:
-        """Let the motion go on by some time of the clock on the wall, s, and draw it."""
+        """Let the motion go on by some time of the clock on the wall, s, and draw it.
+
+        Raises:
+            Exception: what the law raised; the arm stands still.
+        """
         with self._lock:
             woken, asked = self._wake.is_set(), self._asked
             self._wake.clear()
             self._asked = None
-            if woken and self.law.sample_time is None:
-                self._ask()
-            self._go_on(elapsed * self.pace)
-            self._draw()
+            try:
+                if self._in_vain or (woken and self.law.sample_time is None):
+                    self._ask()
+                self._go_on(elapsed * self.pace)
+            finally:
+                self._draw()
         if asked is not None:
             self.server.flush()
             self.answers.append(time.perf_counter() - asked)
@@ -269,30 +305,40 @@ class Live(Page):
                 self._ask()
 
     def _ask(self) -> None:
-        """Ask the law and remember what it says."""
+        """Ask the law and remember what it says; while it cannot be asked the arm stands still.
+
+        Raises:
+            InputError: its joint rates are no motion.
+            Exception: what the law raises.
+        """
         law, n = self.law, self.robot.n_joints
         target = law.layout.flat_targets(self.target) if self.posed else self.target
-        if self.values.size != law.size:
-            self.values = np.zeros(law.size)
-        previous = self.values[6 : 6 + n].copy()
-        law.evaluate(self.q, target, law.layout.flat_velocities(None), self.values, previous, time=self.clock)
-        self.held = 0.0
+        previous, said = self.values[6 : 6 + n].copy(), np.zeros(law.size)
+        self.values, self._in_vain, self.held = np.zeros(law.size), True, 0.0
+        law.evaluate(self.q, target, law.layout.flat_velocities(None), said, previous, time=self.clock)
+        if not np.all(np.abs(said[: 6 + n]) < FASTEST):
+            raise InputError("the law has no joint rates for this target; move it, or go back to the start")
+        self.values, self._in_vain = said, False
         results = self.values[6 + n :]
         past = self.past
         past.time.append(self.clock)
         past.error.append(float(np.linalg.norm(results[kernel.ERRORS : kernel.ERRORS + law.layout.size])))
-        past.rate.append(float(np.abs(self._own_rate()).max(initial=0.0)))
+        rate = self._own_rate()
+        if self.chosen.startswith("the case"):  # of a schedule's directions those count that are fully protected
+            rate = rate[self._shares() == 1.0]
+        past.rate.append(float(np.abs(rate).max(initial=0.0)))
         past.trail.append(results[kernel.POSITION : kernel.POSITION + 3].copy())
 
     def _own_rate(self) -> Floats:
-        """Return the base rate along the directions of the case, or of the present law where it has none."""
+        """Return the base rate (k,) along the directions of the case, or of the present law where it has none."""
         own = next((law for name, law in self.laws.items() if name.startswith("the case")), self.law)
         U_twist, frame = own.directions
-        R = np.eye(3) if frame == "base" else self.robot.coupling(self.q).rotation_of(frame)
-        twist = self.values[:6]
-        if frame == "inertial":
-            R = pin.XYZQUATToSE3(self.q[:7]).rotation
-        return U_twist.T @ np.r_[R @ twist[:3], R @ twist[3:]]
+        return twist_along(U_twist, frame, self.values[None, :6], self.q[None], self.robot)[0]
+
+    def _shares(self) -> Floats:
+        """Return how far each direction of the present law is protected now (k,), 0 to 1."""
+        told = self.law.shares(np.array([self.clock]), self.q[None])
+        return np.ones(self.law.directions[0].shape[1]) if told is None else told[0]
 
     def _draw(self) -> None:
         moved = body_poses(self.robot, self.q[None], self.joints)[0]
@@ -322,8 +368,7 @@ class Live(Page):
         """Return what the arrows show, of the base's pose (7,): the rates that the law commands, and its momentum."""
         directions, frame = self.law.directions
         axes = base[3:] if frame == "base" else self._axes(frame)
-        told = self.law.shares(np.array([self.clock]), self.q[None])
-        shares = np.ones(directions.shape[1]) if told is None else told[0]
+        shares = self._shares()
         rate = rotated(base[3:], self.values[3:6])
         free, protected = split_rate(rate[None], directions[:, shares > 0], axes[None])[:, 0]
         return Vectors(base[:3], base[3:], axes, shares, free, protected, self.law.momentum[3:])
@@ -335,8 +380,13 @@ class Live(Page):
         return pin.Quaternion(turn).coeffs()[[3, 0, 1, 2]]
 
     def outcome(self) -> str:
-        """Return how the motion towards the target stands: "under way", "arrived", "stalled" or "standing"."""
+        """Return how the motion towards the target stands: "under way", "arrived", "stalled" or "standing".
+
+        It is standing where the law cannot be asked.
+        """
         with self._lock:
+            if self._in_vain:
+                return "standing"
             times, errors = np.array(self.past.time), np.array(self.past.error)
             since = times >= self.past.changed - 1e-9
             if not since.any():
@@ -351,7 +401,7 @@ class Live(Page):
             place = 6 + self.robot.n_joints + kernel.ERRORS + self.law.layout.size
             turned = 2.0 * np.arctan2(np.linalg.norm(self.q[3:6]), abs(self.q[6]))
             return {
-                "left": self.past.error[-1] if self.past.error else float("nan"),
+                "left": self.past.error[-1] if self.past.error and not self._in_vain else float("nan"),
                 "sigma": float(self.values[place]),
                 "rho": float(self.values[place + 1]),
                 "rate": self.past.rate[-1] if self.past.rate else 0.0,
@@ -365,7 +415,7 @@ class Live(Page):
         if state == "stalled":
             state = f"stalled, {1e3 * told['left']:.0f} mm left" + (": no way on under this protection" * singular)
         rows = {
-            "left": f"{1e3 * told['left']:.1f} mm",
+            "left": f"{1e3 * told['left']:.1f} mm" if np.isfinite(told["left"]) else "-",
             "sigma": f"{told['sigma']:.1e} m" + (" (singular: damping acts)" if singular else ""),
             "|w_sub|": f"{told['rate']:.0e} rad/s",
             "base turned": f"{np.rad2deg(told['turned']):.3f} deg",
@@ -424,7 +474,11 @@ def case_of(source: str) -> Case:
         InputError: it is neither.
         ModelError: a robot that cannot be read.
     """
-    if source not in models() and Path(source).suffix.lower() not in (".urdf",) and not _is_robot_toml(source):
+    if (
+        source not in models()
+        and Path(source).suffix.lower() not in (".urdf", ".xml", ".mjcf")
+        and not _is_robot_toml(source)
+    ):
         return load_case(source)
     from ssm_decouple.model.catalogue import load_robot
 
@@ -472,6 +526,16 @@ def live(source: str | Case, host: str = HOST, port: int = PORT, mesh_folders: t
         mesh_folders: Where the meshes of the URDF are looked for.
     """
     return Live(source if isinstance(source, Case) else case_of(source), host, port, mesh_folders)
+
+
+def _finite(what: str, given: Any, count: int) -> Floats:
+    try:
+        numbers = np.array(given, dtype=float)
+    except (TypeError, ValueError):
+        numbers = np.empty(0)
+    if numbers.shape != (count,) or not np.all(np.isfinite(numbers)):
+        raise InputError(f"the {what} is {given!r}; it needs {count} finite numbers")
+    return numbers
 
 
 def _width(parts: list[Part]) -> float:

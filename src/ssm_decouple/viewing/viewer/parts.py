@@ -236,11 +236,16 @@ def _stand_in(robot: Robot, visual: _MeshVisual, joint: int, link: pin.SE3) -> P
     end = np.mean([link.actInv(end) for end in ends], axis=0) if ends and joint > 1 else np.zeros(3)
     length, color = float(np.linalg.norm(end)), visual.color or GREY
     if length < 1e-3:
-        edge = (0.3 if joint == 1 else 0.05) * max(robot.reach, 0.2)
+        edge = (0.3 if joint == 1 else 0.05) * max(drawn_reach(robot), 0.2)
         return Part(visual.name, visual.link, joint, "box", (edge,) * 3, link, color)
     turn = pin.Quaternion.FromTwoVectors(np.array([0.0, 0.0, 1.0]), end / length).toRotationMatrix()
     size = (_THICKNESS * length, _THICKNESS * length, length)
     return Part(visual.name, visual.link, joint, "box", size, link * pin.SE3(turn, 0.5 * end), color)
+
+
+def drawn_reach(robot: Robot) -> float:
+    """Return the arm's reach, m, to which drawn things are in proportion: 1 where a joint slides without limits."""
+    return robot.reach if np.isfinite(robot.reach) else 1.0
 
 
 def _skeleton(robot: Robot) -> list[Part]:

@@ -10,7 +10,8 @@ from html import escape
 import numpy as np
 import viser
 
-from ssm_decouple.viewing.viewer.page import Page
+from ssm_decouple.errors import InputError
+from ssm_decouple.viewing.viewer.page import Page, chosen_pace, one_of
 from ssm_decouple.viewing.viewer.plots import Curves, Plots, curves_of, law_colors
 from ssm_decouple.viewing.viewer.scene import Scene, usual_exaggeration
 from ssm_decouple.viewing.viewer.server import HOST, PORT
@@ -53,7 +54,7 @@ class Player(Page):
         self.scenes = list(scenes)
         self.stage = Stage(self.server, self.scenes)
         self.end = max(float(scene.time[-1]) for scene in self.scenes)
-        self.time, self.frames = 0.0, 0
+        self.time, self.frames, self.pace = 0.0, 0, 10.0
         self.playing, self.riding, self.shown = playing, False, Shown()
         self.exaggeration = usual_exaggeration(self.scenes)
         self._rested = 0.0
@@ -77,7 +78,7 @@ class Player(Page):
             # A slider of powers of ten: bendings differ that much.
             start = float(np.log10(self.exaggeration))
             self.bending = gui.add_slider("", 0.0, float(max(3.0, np.ceil(start))), 0.01, start)
-            self.bending.on_update(lambda _: self._on_bending())
+            self.bending.on_update(self._heeding(lambda _: self._on_bending()))
             self._on_bending()
         self.table = gui.add_html(self._table())
         gui.add_html(LEGEND)
@@ -86,15 +87,16 @@ class Player(Page):
             names = tuple(_distinct([scene.name for scene in self.scenes]))
             own = next((i for i, scene in enumerate(self.scenes) if scene.name == "selective"), 0)
             self.chosen = gui.add_dropdown("plots of", names, initial_value=names[own])
-            self.chosen.on_update(lambda _: self._replot())
+            self.chosen.on_update(self._heeding(lambda _: self._replot()))
         self.plots = Plots(self.server, self._curves())
         with gui.add_folder("shown", expand_by_default=False):
             self.checks = {field.name: gui.add_checkbox(_SHOWN[field.name], True) for field in fields(Shown)}
         for check in self.checks.values():
-            check.on_update(lambda _: self._on_shown())
-        self.play_button.on_click(lambda _: self.pause() if self.playing else self.play())
-        self.slider.on_update(self._on_slider)
-        self.view.on_update(lambda _: self._set_riding())
+            check.on_update(self._heeding(lambda _: self._on_shown()))
+        self.play_button.on_click(self._heeding(lambda _: self.pause() if self.playing else self.play()))
+        self.slider.on_update(self._heeding(self._on_slider))
+        self.speed.on_update(self._heeding(lambda _: setattr(self, "pace", chosen_pace(self.speed))))
+        self.view.on_update(self._heeding(lambda _: self._set_riding()))
         self._label_button()
 
     def _on_slider(self, event: viser.GuiEvent[viser.GuiSliderHandle[float]]) -> None:
@@ -104,7 +106,10 @@ class Player(Page):
 
     def _on_bending(self) -> None:
         assert self.bending is not None
-        self.exaggeration = float(f"{10.0**self.bending.value:.2g}")
+        power = self.bending.value
+        if not self.bending.min <= power <= self.bending.max:
+            raise InputError(f"bending is 10^{power:g}; its slider goes to {self.bending.max:g}")
+        self.exaggeration = float(f"{10.0**power:.2g}")
         self.bending.label = f"bending x {self.exaggeration:g}"
         self._wake.set()
 
@@ -113,11 +118,11 @@ class Player(Page):
         self._wake.set()
 
     def _set_riding(self) -> None:
-        self.riding = self.view.value == BASE
+        self.riding = one_of(self.view) == BASE
         self._wake.set()
 
     def _curves(self) -> list[Curves]:
-        chosen = 0 if self.chosen is None else self.chosen.options.index(self.chosen.value)
+        chosen = 0 if self.chosen is None else self.chosen.options.index(one_of(self.chosen))
         return curves_of(self.scenes, chosen)
 
     def _replot(self) -> None:
@@ -141,7 +146,13 @@ class Player(Page):
         self._label_button()
 
     def seek(self, time: float) -> None:
-        """Show a time, s."""
+        """Show a time, s.
+
+        Raises:
+            InputError: it is not a number.
+        """
+        if np.isnan(time):
+            raise InputError("the time to show is not a number; give seconds since the start")
         self.time = float(np.clip(time, 0.0, self.end))
         self._wake.set()
 
@@ -155,7 +166,7 @@ class Player(Page):
         if not self.playing or not self.server.get_clients():
             return False
         if self.time < self.end:
-            self.time = min(self.end, self.time + elapsed * float(self.speed.value.split()[0]))
+            self.time = min(self.end, self.time + elapsed * self.pace)
             self._rested = 0.0
             return True
         self._rested += elapsed
@@ -196,12 +207,13 @@ class Player(Page):
 
 
 def numbers(scene: Scene, now: float) -> tuple[str, str, str, str]:
-    """Return distance to the target (mm), rotation of the base (deg), protected rate and momentum in words."""
+    """Return in words distance to the target (mm, or with its unit), rotation (deg), protected rate and momentum."""
     i = int(np.clip(np.searchsorted(scene.time, now, side="right") - 1, 0, len(scene.time) - 1))
-    left = 1e3 * scene.distance[i]
+    left = float(scene.distance_shown[i])
     protected = "-" if scene.protected_rate is None else f"{scene.protected_rate[i]:.0e}"
     momentum = f"{np.linalg.norm(scene.angular_momentum[i]):.3g}" if scene.has_momentum else "zero"
-    return f"{left:.1f}" if np.isfinite(left) else "-", f"{scene.turned_deg[i]:.3f}", protected, momentum
+    told = f"{left:.1f}" if scene.distance_unit == "mm" else f"{left:.2g} {scene.distance_unit}"
+    return told if np.isfinite(left) else "-", f"{scene.turned_deg[i]:.3f}", protected, momentum
 
 
 def status(scene: Scene, now: float) -> str:

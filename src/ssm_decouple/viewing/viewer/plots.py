@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import viser
 from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
+from ssm_decouple.viewing.angles import JOINT_UNITS, joint_kinds, unwrapped
 from ssm_decouple.viewing.style import AXIS_COLORS, LAW_LINES, joint_colors
 from ssm_decouple.viewing.viewer.scene import Scene
 
@@ -19,6 +21,7 @@ Floats = NDArray[np.float64]
 POINTS = 250  # of a curve: more than the plot has pixels to show
 HEIGHT = 118  # pixels
 FLOOR = 1e-21  # rad/s: zero on a logarithmic axis
+FLOORED = "; -21 is 1e-21 or less: zero or rounding"
 AXES: Any = ({"size": 24}, {"size": 52})
 _OTHERS = ("#56B4E9", "#CC79A7", "#E69F00", "#009E73", "#D55E00", "#F0E442")
 
@@ -40,7 +43,9 @@ class Curves:
     @property
     def range(self) -> tuple[float, float]:
         """What the vertical axis spans: a little more than the curves."""
-        everything = np.concatenate([line for _, _, line in self.lines])
+        everything = np.concatenate([np.zeros(0), *(line[np.isfinite(line)] for _, _, line in self.lines)])
+        if not everything.size:
+            return -1.0, 1.0
         low, high = float(everything.min()), float(everything.max())
         room = 0.06 * (high - low) or max(1e-9, 0.06 * abs(high))
         return low - room, high + room
@@ -68,20 +73,19 @@ def curves_of(scenes: Sequence[Scene], chosen: int) -> list[Curves]:
         return tuple(
             (scene.name, color, np.interp(time, scene.time, line))
             for scene, color, line in zip(scenes, colors, values, strict=True)
-            if line is not None and np.all(np.isfinite(line))
+            if line is not None and np.any(np.isfinite(line))
         )
 
     scene, motion = scenes[chosen], scenes[chosen].motion
     whose = f" of {scene.name}" if len(scenes) > 1 else ""
-    attitude = np.rad2deg(np.unwrap(motion.base_rpy.values, axis=0))
-    rates = np.rad2deg(motion.joint_rates.values)
-    shades = [to_hex(color) for color in joint_colors(rates.shape[1])]
-    shades = [_lighter(shade) for shade in shades]
+    attitude = np.rad2deg(unwrapped(motion.base_rpy.values))
     # Powers of ten, since the axes of a page have no room for longer labels.
     protected = [None if s.protected_rate is None else np.log10(np.maximum(s.protected_rate, FLOOR)) for s in scenes]
+    low = any(s.protected_rate is not None and np.any(s.protected_rate <= FLOOR) for s in scenes)
+    units = {scene.distance_unit for scene in scenes}
     plots = [
-        Curves("left (mm)", time, of_all([1e3 * s.distance for s in scenes])),
-        Curves("|w_sub| (10^x rad/s)", time, of_all(protected)),
+        Curves(f"left ({'; '.join(sorted(units))})", time, of_all([s.distance_shown for s in scenes])),
+        Curves(f"|w_sub| (10^x rad/s{FLOORED if low else ''})", time, of_all(protected)),
         Curves(
             f"base attitude{whose} (deg)",
             time,
@@ -90,16 +94,24 @@ def curves_of(scenes: Sequence[Scene], chosen: int) -> list[Curves]:
                 for i, (name, color) in enumerate(AXIS_COLORS.items())
             ),
         ),
-        Curves(
-            f"joint rates{whose} (deg/s)",
-            time,
-            tuple(
-                (str(name).replace("joint_", ""), shade, np.interp(time, scene.time, rates[:, i]))
-                for i, (name, shade) in enumerate(zip(motion.joint.values, shades, strict=True))
-            ),
-        ),
     ]
-    return [plot for plot in plots if plot.lines]
+    shades = [_lighter(to_hex(color)) for color in joint_colors(motion.sizes["joint"])]
+    own, everywhere = joint_kinds(motion), {kind for s in scenes for kind in joint_kinds(s.motion)}
+    for kind in [kind for kind in JOINT_UNITS if kind in everywhere]:
+        name, unit, factor = JOINT_UNITS[kind]
+        rates = factor * motion.joint_rates.values
+        lines = tuple(
+            (
+                label.replace("joint_", ""),
+                shades[i],
+                np.interp(time, scene.time, rates[:, i]),
+            )
+            for i, label in enumerate(map(str, motion.joint.values))
+            if own[i] == kind
+        )
+        plots.append(Curves(f"{name.split()[0]} rates{whose} ({unit}/s)", time, lines))
+    always = 2 + 1  # of the motions together, and the attitude: those without lines have none for any motion
+    return [plot for i, plot in enumerate(plots) if plot.lines or i >= always]
 
 
 class Plots:
@@ -141,10 +153,10 @@ class Plots:
 
 def caption(title: str, lines: Sequence[tuple[str, str, Floats]]) -> str:
     """Return what stands above a plot: what it shows, and which colour is which."""
-    names = " ".join(f'<span style="color:{color}">&#9632;</span>&nbsp;{name}' for name, color, _ in lines)
+    names = " ".join(f'<span style="color:{color}">&#9632;</span>&nbsp;{escape(name)}' for name, color, _ in lines)
     return (
         f'<div style="font-size:0.78em;padding:0.25em 0.9em 0 0.9em;line-height:1.35">'
-        f"<b>{title}</b> &ensp;{names}</div>"
+        f"<b>{escape(title)}</b> &ensp;{names}</div>"
     )
 
 

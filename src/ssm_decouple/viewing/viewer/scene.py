@@ -174,7 +174,7 @@ class Scene:
         robot = _checked_robot(name, motion)
         turned = json.loads(motion.attrs.get("turned", "{}"))
         parts = spacecraft_parts(robot, turned, mesh_folders)
-        wings = _wings(motion, parts)
+        wings = wings_of(motion, parts)
         bending = {wing.appendage.name for wing in wings}
         rigid = tuple(part for part in parts if part.joint > 1 or part.name not in bending)
         joints = (1, *sorted({part.joint for part in rigid} - {1}))
@@ -212,6 +212,16 @@ class Scene:
     def distance(self) -> Floats:
         """Distance to the target, or the norm of the errors of level 1 (m,), m."""
         return error_of(self.motion)
+
+    @property
+    def distance_unit(self) -> str:
+        """In which unit a page tells the distance: mm, or of other tasks, whose errors mix them, m and rad."""
+        return "m, rad" if "task_error" in self.motion else "mm"
+
+    @property
+    def distance_shown(self) -> Floats:
+        """The distance (m,) in that unit."""
+        return self.distance * (1e3 if self.distance_unit == "mm" else 1.0)
 
     @cached_property
     def turned_deg(self) -> Floats:
@@ -342,6 +352,12 @@ def _checked_robot(name: str, motion: xr.Dataset) -> Robot:
             f"motion '{name}' has configurations of {motion.sizes['q']} numbers and holds the URDF of "
             f"'{robot.name}', which needs {robot.model.nq}: it is the motion of another robot"
         )
+    lost = int(np.sum(~np.isfinite(motion.configuration.values).all(axis=1)))
+    if lost:
+        raise InputError(
+            f"motion '{name}' has {lost} of {motion.sizes['time']} samples whose configuration is not finite; show "
+            "those before them: motion.isel(time=slice(0, ..))"
+        )
     if tuple(motion.joint.values) != robot.joint_names:
         raise InputError(
             f"motion '{name}' moves the joints {', '.join(map(str, motion.joint.values))} and holds the URDF of "
@@ -406,7 +422,7 @@ def _usual_momentum(robot: Robot, motion: xr.Dataset) -> float:
     return robot.mass * max(float(np.abs(motion.joint_rates.values).max(initial=0.0)), 1e-3)
 
 
-def _wings(motion: xr.Dataset, parts: Sequence[Part]) -> tuple[Wing, ...]:
+def wings_of(motion: xr.Dataset, parts: Sequence[Part]) -> tuple[Wing, ...]:
     """Return the appendages that bend. The box on the base that has the name of one is what draws it straight."""
     wings: list[Wing] = []
     first = 0

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 from ssm_decouple.errors import DecoupleWarning, InputError
+from ssm_decouple.viewing.viewer.guard import ANYWHERE, guarded, try_guard
 
 if TYPE_CHECKING:
     import viser
@@ -24,6 +25,8 @@ WIDTH = 380  # pixels: of the controls, in which the table has to fit
 def open_server(host: str = HOST, port: int = PORT, dark: bool = True, panel: bool = True) -> viser.ViserServer:
     """Start a viser server; where the port is taken, on the next that is free, which a warning names.
 
+    It answers those alone who ask for it at an address of this machine and at its own port, and no page from elsewhere.
+
     Args:
         host: Address to listen on; the loopback can be reached from this machine alone.
         port: 0 takes any free one.
@@ -31,7 +34,7 @@ def open_server(host: str = HOST, port: int = PORT, dark: bool = True, panel: bo
         panel: Dock the controls at the right; else there are none.
 
     Raises:
-        InputError: viser is not installed, or the address or the port is none.
+        InputError: viser is not installed, or one that lets any web page in, or the address or the port is none.
     """
     require_viser()
     import viser
@@ -42,8 +45,14 @@ def open_server(host: str = HOST, port: int = PORT, dark: bool = True, panel: bo
     # Browsers open connections ahead of need and close them unused, of which websockets would tell at length.
     logging.getLogger("websockets.server").addFilter(lambda record: record.getMessage() != "opening handshake failed")
     # Its banner would stand between what the command prints; the URL is told in one line instead.
-    with quiet():
+    with quiet(), guarded(host):
         server = viser.ViserServer(host=host, port=port, verbose=False)
+    try:
+        try_guard(host, server.get_port())
+    except InputError:
+        with quiet():
+            server.stop()
+        raise
     if port and server.get_port() != port:
         warnings.warn(f"port {port} is taken; using {server.get_port()}", DecoupleWarning, stacklevel=3)
     server.gui.configure_theme(dark_mode=dark, show_logo=False, show_share_button=False, control_width="large")
@@ -68,7 +77,8 @@ def require_viser() -> None:
 
 def url_of(server: viser.ViserServer, host: str) -> str:
     """Return the address of the page."""
-    return f"http://{'localhost' if host in ('0.0.0.0', '::') else host}:{server.get_port()}"
+    name = "localhost" if host in ANYWHERE else host
+    return f"http://{f'[{name}]' if ':' in name else name}:{server.get_port()}"
 
 
 @contextlib.contextmanager

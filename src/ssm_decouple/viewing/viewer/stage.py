@@ -91,8 +91,11 @@ class Stage:
 
     def _fit(self, client: viser.ClientHandle) -> None:
         """Step back where a page is so narrow that it would cut the wings."""
+        width, height = client.camera.image_width, client.camera.image_height
+        if not (width > 0 and height > 0):  # a page that is hidden has no size
+            return
         with client.atomic():
-            position, middle, fov = self.camera(max(client.camera.aspect, 0.2))
+            position, middle, fov = self.camera(max(width / height, 0.2))
             # The point looked at comes after: viser moves it along with the camera.
             client.camera.position, client.camera.look_at, client.camera.fov = position, middle, fov
 
