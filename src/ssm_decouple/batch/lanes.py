@@ -5,8 +5,6 @@ the compiler turns into vector instructions. In a row of a scratch array `x[c * 
 
 Everything stands in the axes and about the origin of the base frame. The joint axis is the z axis of its joint's
 frame: `constants_of` turns the frames so.
-
-Why one file: Numba keeps compiled code on disk and watches only the file that a function stands in.
 """
 
 from __future__ import annotations

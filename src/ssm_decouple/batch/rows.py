@@ -1,7 +1,4 @@
-"""The compiled motion of many robots at once, row by row: poses, steps and what is kept of them.
-
-Why one file: Numba keeps compiled code on disk and watches only the file that a function stands in.
-"""
+"""The compiled motion of many robots at once, row by row: poses, steps and what is kept of them."""
 
 from __future__ import annotations
 

@@ -2,9 +2,6 @@
 
 Everything that one control step does after Pinocchio has filled its matrices stands in this file. Each function is
 plain Python on NumPy arrays, compiled by Numba; `selective_command.py_func` is the same function uncompiled.
-
-Why one file: Numba keeps compiled code on disk and watches only the file that a function stands in, so a compiled
-function must not call one that stands in another file.
 """
 
 from __future__ import annotations

@@ -1,8 +1,4 @@
-"""The compiled algebra of a limited step: bounds on the rates, null-space coordinates, problems for the QP solver.
-
-Numba keeps compiled code on disk and watches only the file that a function stands in, so none here calls one that
-stands in another file.
-"""
+"""The compiled algebra of a limited step: bounds on the rates, null-space coordinates, problems for the QP solver."""
 
 from __future__ import annotations
 

@@ -2,8 +2,6 @@
 
 Everything stands in the axes and about the origin of the base frame, so that bodies add up without transforms. Without
 gravity the equations do not contain the base's pose: it is integrated beside them.
-
-Why one file: Numba keeps compiled code on disk and watches only the file that a function stands in.
 """
 
 from __future__ import annotations
