@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 import numba
 import numpy as np
+from numba.core.errors import NumbaError as NumbaError  # of an array that no signature knows
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -1038,20 +1039,31 @@ def wrong_size(n: int, parameters: Floats, targets: Floats, velocities: Floats, 
     return vectors or previous.shape[0] != n or out.shape[0] != size
 
 
-@compiled_for("boolean(float64[::1], float64[:, ::1])")
-def off_unit(q: Floats, columns: Floats) -> bool:
-    """Say whether q is not finite, or its quaternion or the cosine and sine of a joint are not of unit length."""
-    for i in range(q.shape[0]):
-        if not abs(q[i]) < np.inf:
-            return True
-    if not abs(np.sqrt(q[3] ** 2 + q[4] ** 2 + q[5] ** 2 + q[6] ** 2) - 1.0) <= UNIT:
-        return True
+@inlined
+def off_unit(q: Floats) -> bool:
+    """Say whether the quaternion of q is not of unit length."""
+    square = q[3] * q[3] + q[4] * q[4] + q[5] * q[5] + q[6] * q[6]
+    return not (1.0 - UNIT) ** 2 <= square <= (1.0 + UNIT) ** 2
+
+
+@compiled
+def off_circle(q: Floats, columns: Floats) -> bool:
+    """Say whether the cosine and sine of a continuous joint are not of unit length."""
     for j in range(columns.shape[1]):
         if columns[CONTINUOUS, j] > 0.0:
             place = int(columns[PLACE, j])
             if not abs(np.sqrt(q[place] ** 2 + q[place + 1] ** 2) - 1.0) <= UNIT:
                 return True
     return False
+
+
+@compiled_for("boolean(float64[::1], float64[:, ::1])")
+def no_configuration(q: Floats, columns: Floats) -> bool:
+    """Say whether q is not finite, or its quaternion or a joint's cosine and sine are not of unit length."""
+    for i in range(q.shape[0]):
+        if not abs(q[i]) < np.inf:
+            return True
+    return off_unit(q) or off_circle(q, columns)
 
 
 @compiled_for(SELECTIVE_COMMAND)
@@ -1088,14 +1100,14 @@ def selective_command(
         q: The configuration (nq,) that Pinocchio was given, whose length it has looked at.
 
     Returns:
-        OK, NOT_FINITE (in the configuration or the targets), NO_INERTIA (H_ww is singular), NOT_UNIT (the quaternion,
-        or the cosine and sine of a joint), WRONG_SIZE (of targets, of `previous` or of `out`), NOT_A_TARGET (no
-        rotation or no direction) or OTHER_MASS (A_g is not of the robot's mass).
+        OK, NOT_FINITE (in the configuration or the targets), NO_INERTIA (H_ww is singular), NOT_UNIT (the quaternion;
+        the cosine and sine of joints are for `off_circle`), WRONG_SIZE (of targets, of `previous` or of `out`),
+        NOT_A_TARGET (no rotation or no direction) or OTHER_MASS (A_g is not of the robot's mass).
     """
     n, m = columns.shape[1], int(parameters[TASK_ROWS])
     if wrong_size(n, parameters, targets, velocities, previous, out):
         return WRONG_SIZE
-    if off_unit(q, columns):
+    if off_unit(q):
         return NOT_UNIT
     # Two allocations for all scratch: each costs as much as a reflection.
     work, small = np.empty((J_TASK + 22 + 2 * m, n)), np.empty((max(2 * m + 7, 11) + 1, 6 + m))
@@ -1325,7 +1337,7 @@ def pose_command(
     """Do what `selective_command` does, and write what it has solved into the other arrays, by `pose_rows`."""
     if wrong_size(columns.shape[1], parameters, targets, velocities, previous, out):
         return WRONG_SIZE
-    if off_unit(q, columns):
+    if off_unit(q) or off_circle(q, columns):
         return NOT_UNIT
     read_joints(q, columns)
     matrices[:] = 0.0
