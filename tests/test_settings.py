@@ -271,8 +271,8 @@ def test_degrees_for_radians_are_told(ets_vii):
     ):
         with pytest.warns(ssm.DecoupleWarning, match="150 rad at 'joint_1' looks like degrees"):
             call()
-    with pytest.warns(ssm.DecoupleWarning, match=r"rate_limit of 'ets_vii': 10 rad/s at 'joint_1' looks like degrees"):
-        ssm.SelectiveLaw(ets_vii, ssm.Protection("yaw"), rate_limit=10.0)
+    with pytest.warns(ssm.DecoupleWarning, match=r"rate_limit of 'ets_vii': 5 rad/s at 'joint_1' looks like degrees"):
+        ssm.SelectiveLaw(ets_vii, ssm.Protection("yaw"), rate_limit=5.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         ets_vii.configuration(np.full(6, 12.0))

@@ -17,6 +17,7 @@ from typing import Any, TypeVar, cast
 
 import numba
 from numba.core.caching import FunctionCache
+from numba.core.errors import NumbaError as NumbaError  # of an array that no signature knows
 
 from ssm_decouple.errors import DecoupleWarning
 

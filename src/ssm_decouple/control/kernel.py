@@ -1062,14 +1062,16 @@ def wrong_size(n: int, parameters: Floats, targets: Floats, velocities: Floats, 
     return vectors or previous.shape[0] != n or out.shape[0] != size
 
 
-@compiled_for("boolean(float64[::1], float64[:, ::1])")
-def off_unit(q: Floats, columns: Floats) -> bool:
-    """Say whether q is not finite, or its quaternion or the cosine and sine of a joint are not of unit length."""
-    for i in range(q.shape[0]):
-        if not abs(q[i]) < np.inf:
-            return True
-    if not abs(np.sqrt(q[3] ** 2 + q[4] ** 2 + q[5] ** 2 + q[6] ** 2) - 1.0) <= UNIT:
-        return True
+@inlined
+def off_unit(q: Floats) -> bool:
+    """Say whether the quaternion of q is not of unit length."""
+    square = q[3] * q[3] + q[4] * q[4] + q[5] * q[5] + q[6] * q[6]
+    return not (1.0 - UNIT) ** 2 <= square <= (1.0 + UNIT) ** 2
+
+
+@compiled
+def off_circle(q: Floats, columns: Floats) -> bool:
+    """Say whether the cosine and sine of a continuous joint are not of unit length."""
     for j in range(columns.shape[1]):
         if columns[CONTINUOUS, j] > 0.0:
             place = int(columns[PLACE, j])
@@ -1083,6 +1085,15 @@ def far_away(placements: Floats) -> bool:
     """Say whether the base, the first joint, is so far from the inertial origin that sums about it lose digits."""
     base = placements[1]
     return abs(base[9]) > FAR or abs(base[10]) > FAR or abs(base[11]) > FAR
+
+
+@compiled_for("boolean(float64[::1], float64[:, ::1])")
+def no_configuration(q: Floats, columns: Floats) -> bool:
+    """Say whether q is not finite, or its quaternion or a joint's cosine and sine are not of unit length."""
+    for i in range(q.shape[0]):
+        if not abs(q[i]) < np.inf:
+            return True
+    return off_unit(q) or off_circle(q, columns)
 
 
 @compiled_for(SELECTIVE_COMMAND)
@@ -1119,14 +1130,14 @@ def selective_command(
         q: The configuration (nq,) that Pinocchio was given, whose length it has looked at.
 
     Returns:
-        OK, NOT_FINITE (in the configuration or the targets), NO_INERTIA (H_ww is singular), NOT_UNIT (the quaternion,
-        or the cosine and sine of a joint), WRONG_SIZE (of targets, of `previous` or of `out`), NOT_A_TARGET (no
-        rotation or no direction), OTHER_MASS (A_g is not of the robot's mass) or FAR_AWAY.
+        OK, NOT_FINITE (in the configuration or the targets), NO_INERTIA (H_ww is singular), NOT_UNIT (the quaternion;
+        the cosine and sine of joints are for `off_circle`), WRONG_SIZE (of targets, of `previous` or of `out`),
+        NOT_A_TARGET (no rotation or no direction), OTHER_MASS (A_g is not of the robot's mass) or FAR_AWAY.
     """
     n, m = columns.shape[1], int(parameters[TASK_ROWS])
     if wrong_size(n, parameters, targets, velocities, previous, out):
         return WRONG_SIZE
-    if off_unit(q, columns):
+    if off_unit(q):
         return NOT_UNIT
     if far_away(placements):
         return FAR_AWAY
@@ -1358,7 +1369,7 @@ def pose_command(
     """Do what `selective_command` does, and write what it has solved into the other arrays, by `pose_rows`."""
     if wrong_size(columns.shape[1], parameters, targets, velocities, previous, out):
         return WRONG_SIZE
-    if off_unit(q, columns):
+    if off_unit(q) or off_circle(q, columns):
         return NOT_UNIT
     if far_away(placements):
         return FAR_AWAY

@@ -11,6 +11,7 @@ import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike, NDArray
 
+from ssm_decouple.compiled import NumbaError
 from ssm_decouple.control import kernel
 from ssm_decouple.control.task import Layout, PositionTask, Task, checked_tasks
 from ssm_decouple.errors import (
@@ -44,8 +45,9 @@ GAUSS: dict[int, tuple[tuple[float, float], ...]] = {
 }
 # One look-up instead of two, in every step.
 centroidal_map, selective_command, array = pin.computeCentroidalMap, kernel.selective_command, np.ndarray
+new = object.__new__
 
-FASTEST = 2 * np.pi  # rad/s: above it a joint's rate limit looks like degrees
+FASTEST, BEYOND = 4 * np.pi, 20.0  # rad/s, and times the URDF's: above it a joint's rate limit looks like degrees
 
 FULL = 1.0  # the pace of a command that is asked for nothing else
 
@@ -373,7 +375,9 @@ class SelectiveLaw(Settled):
             robot, "rate_limit", robot.rate_limits if rate_limit is None else rate_limit
         )
         if rate_limit is not None:
-            warn_of_degrees(robot, "rate_limit", self.rate_limits, FASTEST, "rad/s")
+            warn_of_degrees(
+                robot, "rate_limit", self.rate_limits, np.minimum(FASTEST, BEYOND * robot.rate_limits), "rad/s"
+            )
         self.acceleration_limits: Floats | None = None
         if acceleration_limit is not None:
             self.acceleration_limits = per_joint(robot, "acceleration_limit", acceleration_limit)
@@ -523,12 +527,15 @@ class SelectiveLaw(Settled):
         views = (data.Ag, data.J, _placements(data, model.njoints))
         constants = (U_c, layout.table.copy(), columns, parameters)
         self._prepared = (model, data, views, constants, (*views, *constants))
+        self._hot = (model, data, (*views, *constants))  # of it what every step needs
         self._reads_joints = bool(np.any(layout.table[:, kernel.KIND] == kernel.JOINTS))
         self._flat, self._climbs = layout.plain, layout.climbs
-        self._quick = not self._reads_joints  # and no limits
+        # What has to look at joints or plans goes another way, as do limits.
+        looks = self._reads_joints or self._climbs is not None or bool(columns[kernel.CONTINUOUS].any())
+        self._quick = not (looks or self.hold_nodes)
         self._at_rest: Floats = np.zeros(layout.target_sizes[1])  # writable, as the kernel wants it; never written
         self._n, self._k = n, self.protection.k
-        self._no_rates: Floats = np.zeros(n)
+        self._from_rest: Floats | None = None if limited else np.zeros(n)  # the previous rates, where they do nothing
         self._any_target: Floats = layout.any_target()
         self._J_base: Floats = np.zeros((6, n))
         self._J_here: Floats = np.zeros((6, n))
@@ -622,7 +629,9 @@ class SelectiveLaw(Settled):
             target_velocity = self._at_rest
         values = np.empty(self.size)
         self.evaluate(q, target, target_velocity, values, previous_rates, protected_rate, pace, time)
-        return Command(values, self._n, self._k, self.layout)
+        command = new(Command)  # a call of the class would cost twice as much
+        command.values, command.n, command.k, command.layout = values, self._n, self._k, self.layout
+        return command
 
     def evaluate(
         self,
@@ -661,36 +670,27 @@ class SelectiveLaw(Settled):
                 parameters[:] = usual
             return
         if previous_rates is None:
-            if self.acceleration_limits is not None:
+            previous_rates = self._from_rest
+            if previous_rates is None:
                 raise InputError("an acceleration limit needs previous_rates: those commanded before, zeros from rest")
-            previous_rates = self._no_rates
         elif type(previous_rates) is not array:
             previous_rates = self._checked_rates(previous_rates)
-        if self._climbs is not None:
-            place, gain = self._climbs
-            velocities = self._flat_vectors(target, target_velocity)[1].copy()
-            velocities[place] = self._rates_that_climb(q, gain)
-            target_velocity = velocities
-        model, data, _, _, fixed = self._prepared
+        model, data, fixed = self._hot
         try:  # arrays of the right kind are not looked at twice
-            if not (type(q) is type(target) is type(target_velocity) is type(out) is array):
+            if not (q.__class__ is target.__class__ is target_velocity.__class__ is array):
                 raise TypeError  # a subclass: a masked array would pass as what lies under its mask
-            centroidal_map(model, data, q)
-            # A q that Pinocchio reads in its own way, such as one of another byte order, does not fit here.
-            status = (
-                selective_command(*fixed, target, target_velocity, previous_rates, out, q)
-                if self._quick
-                else self._other_command(q, target, target_velocity, previous_rates, out)
-            )
-        except (TypeError, ValueError):  # a list, another layout, a read-only array or a wrong length
+            if self._quick:
+                centroidal_map(model, data, q)
+                # A q that Pinocchio reads in its own way, such as one of another byte order, does not fit here.
+                status = selective_command(*fixed, target, target_velocity, previous_rates, out, q)
+            else:
+                status = self._other_command(q, target, target_velocity, previous_rates, out)
+        except (TypeError, ValueError, NumbaError):  # a list, another layout, read-only, a wrong length
             q = self.robot.checked(q)
             target, target_velocity = self._flat_vectors(target, target_velocity)
             previous_rates = self._checked_rates(previous_rates)
-            pin.computeCentroidalMap(model, data, q)
             out = self._checked_out(out)
             status = self._other_command(q, target, target_velocity, previous_rates, out)
-        if self.hold_nodes and status == kernel.OK:
-            status = self._hold(q, np.asarray(target), np.asarray(target_velocity), np.asarray(previous_rates), out)
         if status:
             if status == kernel.FAR_AWAY:
                 self._evaluate_from_base(q, target, target_velocity, out, previous_rates)
@@ -708,15 +708,23 @@ class SelectiveLaw(Settled):
         self.evaluate(near, self.layout.targets_from(origin, targets), velocities, out, previous)
         out[6 + self._n + kernel.POSITION :][:3] += origin
 
-    def _other_command(
-        self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, previous: ArrayLike, out: Floats
-    ) -> int:
-        """Do what `selective_command` does for a law that reads joint positions or brings its rates inside limits."""
+    def _other_command(self, q: Floats, target: Floats, velocity: Floats, previous: Floats, out: Floats) -> int:
+        """Do what `selective_command` does, also where joint positions are read or have limits, or the law plans."""
+        model, data, _, (_, _, columns, _), fixed = self._prepared
+        pin.computeCentroidalMap(model, data, q)
+        if kernel.no_configuration(q, columns):
+            return kernel.NOT_UNIT
+        if self._climbs is not None:
+            place, gain = self._climbs
+            velocity = self._flat_vectors(target, velocity)[1].copy()
+            velocity[place] = self._rates_that_climb(q, gain)
+            pin.computeCentroidalMap(model, data, q)
         if self._step is not None:
-            return self._limited_command(q, target, target_velocity, previous, out)
-        _, _, _, (_, _, columns, _), fixed = self._prepared
-        kernel.read_joints(q, columns)  # type: ignore[arg-type]
-        return selective_command(*fixed, target, target_velocity, previous, out, q)  # type: ignore[arg-type]
+            status = self._limited_command(q, target, velocity, previous, out)
+        else:
+            kernel.read_joints(q, columns)
+            status = selective_command(*fixed, target, velocity, previous, out, q)
+        return self._hold(q, target, velocity, previous, out) if self.hold_nodes and status == kernel.OK else status
 
     def _limited_command(
         self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, previous: ArrayLike, out: Floats
@@ -797,7 +805,7 @@ class SelectiveLaw(Settled):
         """
         model, data, (A_g, *_), (_, _, columns, parameters), _ = self._prepared
         plain = type(q) is array and q.dtype == np.float64 and q.shape == (model.nq,) and q.flags.carray
-        if not plain or kernel.off_unit(q, columns):
+        if not plain or kernel.no_configuration(q, columns):
             q = self.robot.checked(q)
         plain = type(joint_rates) is array and joint_rates.dtype == np.float64 and joint_rates.shape == (self._n,)
         if not (plain and joint_rates.flags.c_contiguous):

@@ -64,7 +64,9 @@ class Limits:
             raise InputError(f"clearance is {shown(self.clearance)}; give a Clearance, such as Clearance(0.05)")
         if self.position is not None:
             position = as_floats("position limits", self.position)
-            if position.ndim != 2 or np.any(np.isnan(position)):
+            if np.any(np.isnan(position)):
+                raise InputError(f"position limits are {shown(position.tolist())}; nan is no limit, infinity is none")
+            if position.ndim != 2:
                 raise InputError(
                     f"position limits have shape {position.shape}; they need (n, 2) numbers: lower and upper, a row "
                     "a joint"

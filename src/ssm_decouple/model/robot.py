@@ -575,14 +575,14 @@ def checked_robot(robot: Robot) -> Robot:
     return as_kind("robot", robot, Robot, mend)
 
 
-def warn_of_degrees(robot: Robot, name: str, sizes: Floats, largest: float, unit: str) -> None:
+def warn_of_degrees(robot: Robot, name: str, sizes: Floats, largest: Floats | float, unit: str) -> None:
     """Warn where a joint that turns, other than a wheel, has a number above what radians would come to.
 
     Args:
         robot: The robot.
         name: What the numbers are called.
         sizes: (n,); infinite ones are no numbers.
-        largest: What is looked at as degrees above it.
+        largest: Above it a number is looked at as degrees; one, or one a joint.
         unit: Of the numbers.
 
     Warns:

@@ -110,9 +110,9 @@ class Servo:
         object.__setattr__(self, "protects", as_switch("servo protects", self.protects))
         if self.torque_limits is not None:
             limits = as_floats("torque_limits", self.torque_limits)
-            if limits.ndim > 1 or not np.all(limits > 0):
+            if limits.ndim > 1:  # whether they fit the joints is for the robot to say
                 raise InputError(
-                    f"torque_limits is {shown(self.torque_limits)}; give one positive number, N m, or one a joint"
+                    f"torque_limits is {shown(self.torque_limits)}; give one positive number or one for each joint, N m"
                 )
             object.__setattr__(self, "torque_limits", tuple(limits.tolist()) if limits.ndim else float(limits))
 
