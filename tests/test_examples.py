@@ -20,6 +20,7 @@ PRINTS = {
     "tumbling_target": "feed-forward                              at most   0.182 mm",
     "two_arms": "pose      yaw        100.0 (43.9 to 100.0)    0.0 ( 0.0 to  56.1)         3",
 }
+CHATTERS = ("case1", "own_axis")  # some of their motions do, at a singularity, and say so
 WORDS = {"control_loop": ["1"]}  # seconds
 
 
@@ -33,7 +34,12 @@ def test_example(name, tmp_path):
     done = subprocess.run(words, capture_output=True, text=True, cwd=tmp_path, timeout=300)
     assert done.returncode == 0, done.stderr
     assert PRINTS[name] in done.stdout
-    assert done.stderr == ""
+    told = [line for line in done.stderr.splitlines() if "Warning" in line]
+    if name in CHATTERS:
+        assert told
+        assert all("the commanded rates reverse from sample to sample" in line for line in told)
+    else:
+        assert done.stderr == ""
 
 
 def test_own_robot_takes_another_urdf(tmp_path):
