@@ -45,7 +45,7 @@ GAUSS: dict[int, tuple[tuple[float, float], ...]] = {
 }
 # One look-up instead of two, in every step.
 centroidal_map, selective_command, array = pin.computeCentroidalMap, kernel.selective_command, np.ndarray
-new = object.__new__
+new, FLOATS = object.__new__, np.dtype(np.float64)
 
 FASTEST, BEYOND = 4 * np.pi, 20.0  # rad/s, and times the URDF's: above it a joint's rate limit looks like degrees
 
@@ -398,6 +398,9 @@ class SelectiveLaw(Settled):
             self._prepare_limits(limits)
         if tasks is not None:
             self._refuse_what_nothing_is_left_for()
+        # Whether a call can go round `evaluate`, which would tell it nothing more.
+        plain = self._quick and self.acceleration_limits is None
+        self._direct = plain and type(self).evaluate is SelectiveLaw.evaluate
 
     @property
     def limited(self) -> LimitedRates | None:
@@ -527,7 +530,7 @@ class SelectiveLaw(Settled):
         views = (data.Ag, data.J, _placements(data, model.njoints))
         constants = (U_c, layout.table.copy(), columns, parameters)
         self._prepared = (model, data, views, constants, (*views, *constants))
-        self._hot = (model, data, (*views, *constants))  # of it what every step needs
+        self._hot = (model, data, *views, *constants)  # of it what every step needs
         self._reads_joints = bool(np.any(layout.table[:, kernel.KIND] == kernel.JOINTS))
         self._flat, self._climbs = layout.plain, layout.climbs
         # What has to look at joints or plans goes another way, as do limits.
@@ -535,7 +538,7 @@ class SelectiveLaw(Settled):
         self._quick = not (looks or self.hold_nodes)
         self._at_rest: Floats = np.zeros(layout.target_sizes[1])  # writable, as the kernel wants it; never written
         self._n, self._k = n, self.protection.k
-        self._from_rest: Floats | None = None if limited else np.zeros(n)  # the previous rates, where they do nothing
+        self._no_rates: Floats = np.zeros(n)
         self._any_target: Floats = layout.any_target()
         self._J_base: Floats = np.zeros((6, n))
         self._J_here: Floats = np.zeros((6, n))
@@ -628,7 +631,10 @@ class SelectiveLaw(Settled):
         if target_velocity is None:
             target_velocity = self._at_rest
         values = np.empty(self.size)
-        self.evaluate(q, target, target_velocity, values, previous_rates, protected_rate, pace, time)
+        if self._direct and previous_rates is None and protected_rate is None and pace is FULL:
+            self._fill(q, target, target_velocity, self._no_rates, values)
+        else:
+            self.evaluate(q, target, target_velocity, values, previous_rates, protected_rate, pace, time)
         command = new(Command)  # a call of the class would cost twice as much
         command.values, command.n, command.k, command.layout = values, self._n, self._k, self.layout
         return command
@@ -670,19 +676,32 @@ class SelectiveLaw(Settled):
                 parameters[:] = usual
             return
         if previous_rates is None:
-            previous_rates = self._from_rest
-            if previous_rates is None:
+            if self.acceleration_limits is not None:
                 raise InputError("an acceleration limit needs previous_rates: those commanded before, zeros from rest")
-        elif type(previous_rates) is not array:
+            previous_rates = self._no_rates
+        elif not (type(previous_rates) is array and previous_rates.dtype is FLOATS):
             previous_rates = self._checked_rates(previous_rates)
-        model, data, fixed = self._hot
-        try:  # arrays of the right kind are not looked at twice
-            if not (q.__class__ is target.__class__ is target_velocity.__class__ is array):
-                raise TypeError  # a subclass: a masked array would pass as what lies under its mask
+        if not (type(out) is array and out.dtype is FLOATS):
+            self._checked_out(out)
+        self._fill(q, target, target_velocity, previous_rates, out)
+
+    def _fill(
+        self, q: ArrayLike, target: ArrayLike, target_velocity: ArrayLike, previous_rates: ArrayLike, out: Floats
+    ) -> None:
+        """Compute a command at full pace into an array, from arguments of which rates and array are looked at."""
+        model, data, A_g, J, placements, U_c, tasks, columns, parameters = self._hot
+        try:
+            # Pinocchio and Numba may read arrays of another byte order as they lie, and masked ones without their mask.
+            if not (
+                q.__class__ is target.__class__ is target_velocity.__class__ is array
+                and q.dtype is target.dtype is target_velocity.dtype is FLOATS
+            ):
+                raise TypeError
             if self._quick:
                 centroidal_map(model, data, q)
-                # A q that Pinocchio reads in its own way, such as one of another byte order, does not fit here.
-                status = selective_command(*fixed, target, target_velocity, previous_rates, out, q)
+                status = selective_command(  # unpacking its arguments from a tuple would take a hundredth of the step
+                    A_g, J, placements, U_c, tasks, columns, parameters, target, target_velocity, previous_rates, out, q
+                )
             else:
                 status = self._other_command(q, target, target_velocity, previous_rates, out)
         except (TypeError, ValueError, NumbaError):  # a list, another layout, read-only, a wrong length

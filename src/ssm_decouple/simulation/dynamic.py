@@ -110,7 +110,7 @@ class Servo:
         object.__setattr__(self, "protects", as_switch("servo protects", self.protects))
         if self.torque_limits is not None:
             limits = as_floats("torque_limits", self.torque_limits)
-            if limits.ndim > 1:  # whether they fit the joints is for the robot to say
+            if limits.ndim > 1 or np.any(np.isnan(limits)):  # whether they fit the joints is for the robot to say
                 raise InputError(
                     f"torque_limits is {shown(self.torque_limits)}; give one positive number or one for each joint, N m"
                 )
