@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 import ssm_decouple as ssm
 from ssm_decouple.batch.engine import Batch
 from ssm_decouple.cli.commands import app
-from ssm_decouple.errors import MOST_BYTES, as_count, refuse_more_than_fits
+from ssm_decouple.errors import MOST_BYTES, as_whole, refuse_more_than_fits
 from ssm_decouple.simulation import dynamic
 from ssm_decouple.studies.campaign import Campaign
 from ssm_decouple.studies.robustness import Robustness
@@ -157,14 +157,14 @@ def test_a_body_that_does_not_turn_may_be_asked_for_any_time():
 @pytest.mark.parametrize("bad", [0, -1, 1.5, True, "3", None, np.nan])
 def test_counts_are_whole_numbers(bad):
     with pytest.raises(ssm.InputError, match=r"count is .*; give a whole number from 1"):
-        as_count("count", bad, 10)
+        as_whole("count", bad, 1, "give a whole number from 1", 10)
 
 
 def test_counts_and_bytes():
-    assert as_count("count", np.int32(10), 10) == 10
+    assert as_whole("count", np.int32(10), most=10) == 10
     for large in (11, 10**40, 10**5000):
         with pytest.raises(ssm.InputError, match="10 at most"):
-            as_count("count", large, 10)
+            as_whole("count", large, most=10)
     refuse_more_than_fits("it", MOST_BYTES, "mend")
     for size in (MOST_BYTES + 1, np.inf, np.nan):
         with pytest.raises(ssm.InputError, match=r"it would take .* at most; mend"):

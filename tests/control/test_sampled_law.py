@@ -72,8 +72,8 @@ def test_the_planned_command_is_the_law_on_averaged_matrices(ets_vii):
 
 
 def test_held_steps_are_of_sixth_order(ets_vii, rng):
-    """One hold of two seconds in one step, in two, in four, against a hundred."""
-    from ssm_decouple.simulation.steps import held
+    """One hold of two seconds in two pieces, in four, in eight, against a hundred."""
+    from ssm_decouple.simulation.steps import hold_piece
 
     law = SelectiveLaw(ets_vii, Protection("none"))
     q0, rates = random_state(ets_vii, rng), rng.uniform(-0.4, 0.4, 6)
@@ -81,8 +81,8 @@ def test_held_steps_are_of_sixth_order(ets_vii, rng):
 
     def after(steps):
         q, turned = q0, np.zeros(6)
-        for i in range(steps):
-            q, more = held(law, None, q, values, 2.0 * i / steps, 2.0 * (i + 1) / steps)
+        for _ in range(steps):
+            q, more = hold_piece(law, q, values, 2.0 / steps)
             turned = turned + more
         return q, turned
 

@@ -340,6 +340,7 @@ def wheeled(robot):
     return both, both.configuration({f"joint_{i + 1}": angle for i, angle in enumerate(START)})
 
 
+@pytest.mark.filterwarnings("ignore:wheels need more torque:ssm_decouple.errors.DecoupleWarning")
 def test_a_wheel_that_turns_many_times_between_samples(ets_vii):
     both, q = wheeled(ets_vii)
     law = ssm.SelectiveLaw(both, ssm.Protection("all"), gain=0.05)

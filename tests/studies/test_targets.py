@@ -93,6 +93,7 @@ def test_the_same_seed_gives_the_same_targets_and_rows(trials):
     assert np.abs(other.positions - fewer.positions).max() > 0.1
 
 
+@pytest.mark.filterwarnings("ignore:the commanded rates reverse:ssm_decouple.errors.DecoupleWarning")
 @pytest.mark.parametrize("name", ["none", "selective"])
 def test_rows_are_what_simulate_says_one_at_a_time(trials, name):
     """All end alike; motions that stay clear of singularities, which amplify rounding, end at the same place."""

@@ -121,7 +121,8 @@ def test_no_input_of_the_live_page_stops_its_clock(live, visit, capfd):
 
 def test_a_target_beyond_all_reach_is_followed_or_refused(live, visit):
     visitor = visit(live)
-    law = SelectiveLaw(live.robot, ssm.Protection("none"), gain=0.05, rate_limit=np.full(6, 1e300))
+    with pytest.warns(ssm.DecoupleWarning, match="looks like degrees"):
+        law = SelectiveLaw(live.robot, ssm.Protection("none"), gain=0.05, rate_limit=np.full(6, 1e300))
     live.laws["none"] = law
     live.protect("none")
     start = live.target.copy()
@@ -142,6 +143,7 @@ class Failing(SelectiveLaw):
     """A law that does as it is told."""
 
     error: object = None
+    _assignable = (*SelectiveLaw._assignable, "error")
 
     def evaluate(self, q, target, velocity, out, *rest, **named):
         said = super().evaluate(q, target, velocity, out, *rest, **named)

@@ -93,15 +93,15 @@ def hold_rates(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> tuple[Float
             "shorter dt"
         )
     if needed <= 1.0:
-        return _hold_piece(law, q, v, h)
+        return hold_piece(law, q, v, h)
     pieces, moved = int(np.ceil(needed)), np.zeros((2, 6))
     for _ in range(pieces):
-        q, more = _hold_piece(law, q, np.r_[law.base_twist(q, v[6:]), v[6:]], h / pieces)
+        q, more = hold_piece(law, q, np.r_[law.base_twist(q, v[6:]), v[6:]], h / pieces)
         moved += more
     return q, moved
 
 
-def _hold_piece(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> tuple[Floats, Floats]:
+def hold_piece(law: SelectiveLaw, q: Floats, v: Floats, h: float) -> tuple[Floats, Floats]:
     """Hold joint rates for a short time: the base follows by a sixth-order Magnus expansion on three Gauss points.
 
     In base axes its twist depends on the joints alone, so the base pose at those points is not needed. The integrals of
