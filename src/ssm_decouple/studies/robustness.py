@@ -169,9 +169,10 @@ class Robustness(Settled):
             ("workers", MOST_WORKERS, "workers do nothing"),
         ):
             try:
-                setattr(self, name, as_whole(name, getattr(self, name), most=most))
+                setattr(self, name, as_whole(name, getattr(self, name)))
             except InputError:
-                raise InputError(f"{shown(getattr(self, name))} {wrong}; give from 1 to {most:,}") from None
+                raise InputError(f"{shown(getattr(self, name))} {wrong}; give at least 1") from None
+            as_whole(name, getattr(self, name), most=most)
         self.feedback_gain = as_positive("feedback_gain", self.feedback_gain, "it must be positive, 1/s")
         self.seed = as_seed("seed", self.seed)
         if self.case.protection.k == 0 or np.any(self.case.protection.U_twist[:3]):

@@ -579,8 +579,7 @@ def _percentiles(values: Floats, share: float) -> Triple | None:
 
 def _check_count(count: int) -> None:
     try:
-        as_whole("count", count, most=MOST_TARGETS)
+        as_whole("count", count)
     except InputError:
-        raise InputError(
-            f"{shown(count)} targets are no study; give a whole number from 1 to {MOST_TARGETS:,}"
-        ) from None
+        raise InputError(f"{shown(count)} targets are no study; give a whole number from 1") from None
+    as_whole("count of targets", count, most=MOST_TARGETS)
