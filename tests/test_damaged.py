@@ -445,7 +445,7 @@ def test_a_motion_of_another_program_is_read_and_told(motion, tmp_path):
 def test_a_place_that_is_no_file_is_not_written_over(motion, tmp_path):
     os.mkfifo(tmp_path / "pipe.nc")
     for place in (tmp_path / "pipe.nc", tmp_path / ("n" * 300), tmp_path / "nul\0.nc"):
-        with pytest.raises(ssm.FileError, match="cannot write|NUL character"):
+        with pytest.raises(ssm.FileError, match=r"cannot write|NUL character"):
             ssm.save_motion(motion, place)
     with pytest.raises(ssm.InputError, match="path is ''; give a path"):
         ssm.save_motion(motion, "")
