@@ -180,7 +180,7 @@ def leaks() -> list[Leak]:
     """Return the Monte Carlo study of cases 1 to 3, computed once for the table and the figure."""
     rows = []
     for i in (1, 2, 3):
-        campaign = Robustness(ssm.load_case(f"case{i}"))
+        campaign = Robustness(ssm.load_case(f"case{i}"), runs=40)
         campaign.run(lambda share, i=i: print(f"\rcase{i} {share:4.0%}", end="", file=sys.stderr))
         rows += campaign.leaks()
     return rows
