@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import resource
 import time
 import warnings
@@ -26,14 +25,7 @@ from ssm_decouple.studies.robustness import Robustness, tolerances_at
 from ssm_decouple.studies.targets import end_of_path, random_starts, random_targets
 from ssm_decouple.studies.workspace import Grid, Workspace, arm_joints, interval, joint_slice
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _in_a_scratch_folder(tmp_path_factory: pytest.TempPathFactory):
-    """What a door writes under a strange name lands here."""
-    before = os.getcwd()
-    os.chdir(tmp_path_factory.mktemp("scratch"))
-    yield
-    os.chdir(before)
+pytestmark = pytest.mark.usefixtures("scratch_folder")  # what a door writes under a strange name lands here
 
 
 A = np.deg2rad([150.0, -20, -10, 5, 10, 20])

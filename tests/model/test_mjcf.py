@@ -1,6 +1,5 @@
 """MJCF against MuJoCo itself: what the two make of the same file, body by body and number by number."""
 
-import os
 import xml.etree.ElementTree as ET
 from pathlib import Path
 
@@ -14,14 +13,7 @@ from mujoco_robots import mass_matrix
 
 import ssm_decouple as ssm
 
-
-@pytest.fixture(autouse=True, scope="module")
-def _in_a_scratch_folder(tmp_path_factory: pytest.TempPathFactory):
-    """MuJoCo writes a log into the folder that it runs in."""
-    before = os.getcwd()
-    os.chdir(tmp_path_factory.mktemp("scratch"))
-    yield
-    os.chdir(before)
+pytestmark = pytest.mark.usefixtures("scratch_folder")  # MuJoCo writes a log into the folder that it runs in
 
 
 BUS = '<inertial pos="0.1 0 0.05" mass="100" diaginertia="20 25 30"/>'
