@@ -39,7 +39,8 @@ def compiled_for(*signature: str, inline: str = "never", nogil: bool = False) ->
     """
 
     def decorate(function: F) -> F:
-        dispatcher = numba.njit(inline=inline, nogil=nogil, error_model="numpy")(function)
+        njit: Any = numba.njit
+        dispatcher = njit(inline=inline, nogil=nogil, error_model="numpy")(function)
         try:
             dispatcher._cache = SourceCache(function)
         except RuntimeError:  # from Numba: no folder can be written
@@ -58,17 +59,17 @@ inlined = compiled_for(inline="always")
 unlocked = compiled_for(nogil=True)
 
 
-class SourceCache(FunctionCache):  # type: ignore[misc]
+class SourceCache(FunctionCache):
     """Numba's cache of a function, with a stamp that changes with any of the files that its code comes from."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        super().__init__(function)
+        super().__init__(function)  # type: ignore[no-untyped-call]
         self._cache_file._source_stamp = source_stamp(function.__module__)
 
     def save_overload(self, sig: Any, data: Any) -> None:
         """Keep compiled code; where the disk is full the code in memory still is good."""
         try:
-            super().save_overload(sig, data)
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
         except OSError as error:
             _tell_that_nothing_is_kept(f": {error.strerror or error}")
 
